@@ -1,0 +1,1 @@
+"""What runs on a vehicle: sub-maps, compression, the follower and the leader."""

@@ -1,0 +1,1 @@
+"""The follower: pings and answers in, packets out."""

@@ -1,0 +1,1 @@
+"""The leader: pings and packets in; trajectories, map and answers out."""

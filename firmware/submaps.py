@@ -1,0 +1,74 @@
+"""The values a sub-map is made of, from soundings to grid."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from firmware.geometry import Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Track:
+    """States of one vehicle in raw dead reckoning, nominally once a second, time ascending.
+
+    All arrays are (T,). States lost on the way are simply not there.
+    """
+
+    time_s: Array
+    north_m: Array
+    east_m: Array
+    yaw_rad: Array
+
+    def position_at(self, time_s: Array | float) -> Array:
+        """Return north, east (..., 2) at the times, interpolated, held constant beyond the ends."""
+        return np.stack(
+            [
+                np.interp(time_s, self.time_s, self.north_m),
+                np.interp(time_s, self.time_s, self.east_m),
+            ],
+            axis=-1,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BinnedSoundings:
+    """Soundings thinned to the mean of each occupied cell; all arrays are (K,).
+
+    variance_m2 is that of the mean depth; time_s is the mean time at which the cell was measured.
+    """
+
+    cell_m: float
+    north_m: Array
+    east_m: Array
+    depth_m: Array
+    variance_m2: Array
+    count: Array
+    time_s: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Submap:
+    """Forty seconds of one vehicle's survey, in raw dead reckoning."""
+
+    vehicle: int
+    boot_epoch: int
+    index: int
+    track: Track
+    bins: BinnedSoundings
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GriddedSubmap:
+    """Depths on a regular grid in raw dead reckoning.
+
+    Cell (i, j) lies at north0_m + i cell_m, east0_m + j cell_m. depth_m, variance_m2 and time_s
+    are (R, C), NaN where nothing is known. time_s says when the cell was measured, so that drift
+    within the sub-map can be taken out.
+    """
+
+    north0_m: float
+    east0_m: float
+    cell_m: float
+    depth_m: Array
+    variance_m2: Array
+    time_s: Array

@@ -1,0 +1,1 @@
+"""Modem dialects on pseudo-terminals, over one simulated water."""

@@ -1,0 +1,1 @@
+"""The truth: seabed, vehicles and multibeam sonar. Nothing under firmware may import it."""

@@ -1,0 +1,1 @@
+"""What crosses the water: packets, codec, reassembly, the medium and the modems."""

@@ -1,0 +1,1 @@
+"""Modem drivers behind one interface, chosen by URL."""

@@ -14,18 +14,26 @@ class LocalProtocolError(ProtocolError):
 
 
 class RemoteProtocolError(ProtocolError):
-    """The peer, or the sea, sent what cannot be accepted: counted and dropped."""
+    """The peer, or the sea, sent what cannot be accepted: counted and dropped.
+
+    `cause` is one word for the counter that the drop belongs to: size, crc, version, profile,
+    layout, or one of the causes in `protocol.seal`.
+    """
+
+    def __init__(self, message: str, *, cause: str = "layout") -> None:
+        super().__init__(message)
+        self.cause = cause
 
 
 class ModemError(FathomError):
     """A modem did not do what it was asked."""
 
 
-class ModemTimeout(ModemError, TimeoutError):
+class ModemTimeout(ModemError, TimeoutError):  # noqa: N818  the name says what happened
     """A modem did not answer in time."""
 
 
-class ModemUnavailable(ModemError):
+class ModemUnavailable(ModemError):  # noqa: N818  the name says what happened
     """The port is not there, or has vanished."""
 
 

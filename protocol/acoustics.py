@@ -1,0 +1,323 @@
+"""The water: airtime, travel time, half-duplex, collisions, loss, damage, echoes, noisy ranges.
+
+A broadcast medium in simulated time, a function of its seed and of what is transmitted when. Each
+purpose and each directed link draws from a generator of its own, so that switching one effect on,
+or adding a vehicle, leaves every other draw as it was.
+"""
+
+import heapq
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from protocol.errors import ConfigError, LocalProtocolError
+from protocol.settings import Settings, setting
+
+Position = tuple[float, float, float]
+"""North, east, depth in metres, true."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WaterSettings(Settings):
+    """How the sea treats frames; the defaults are the paper's section 6."""
+
+    rate_bps: float = setting(1000.0, "bit/s", "section 1 of the paper", minimum=1.0)
+    sound_speed_mps: float = setting(1500.0, "m/s", "section 1 of the paper", minimum=1300.0)
+    loss: float = setting(0.14, "share", "section 6.2 of the paper", minimum=0.0, maximum=1.0)
+    loss_model: str = setting(
+        "independent",
+        "",
+        "the paper names a share only; gilbert-elliott makes it come in bursts",
+        choices=("independent", "gilbert-elliott"),
+    )
+    burst_frames: float = setting(
+        4.0, "frames", "mean length of a bad spell of Gilbert-Elliott", minimum=1.0
+    )
+    bad_state_loss: float = setting(
+        1.0, "share", "loss during a bad spell of Gilbert-Elliott", minimum=0.01, maximum=1.0
+    )
+    corruption: float = setting(
+        0.0, "share", "modems check their frames; raw lines do not", minimum=0.0, maximum=1.0
+    )
+    corrupt_bits: float = setting(
+        8.0, "bits", "mean number of bits turned in a corrupted frame", minimum=1.0
+    )
+    duplication: float = setting(
+        0.0, "share", "frames heard twice by a surface echo", minimum=0.0, maximum=1.0
+    )
+    echo_delay_s: float = setting(0.2, "s", "of the second copy: 300 m more of path", minimum=0.0)
+    range_noise_m: float = setting(1.0, "m", "Eq. 13: N(0, 1)", minimum=0.0)
+    outlier_share: float = setting(
+        0.2,
+        "share",
+        "Eq. 14: epsilon = 0.2, read as the outliers' share; 0.8 is the letter's reading",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    outlier_factor: float = setting(1.1, "", "Eq. 14: delta_r", minimum=0.1)
+    reach_m: float = setting(
+        20_000.0,
+        "m",
+        "beyond it nothing is heard; the clock's second is unambiguous to 23 km",
+        minimum=1.0,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Delivery:
+    """What became of one frame at one receiver.
+
+    t_rx_s is the measured arrival of the first bit, noise and outlier included, None when nothing
+    was received; the frame is complete, and handed over, at `t_delivered_s`. fate is delivered,
+    corrupt, duplicate, lost, collision, half-duplex or out-of-reach.
+    """
+
+    source: int
+    destination: int
+    t_tx_s: float
+    t_rx_s: float | None
+    t_delivered_s: float
+    frame: bytes
+    fate: str
+
+    @property
+    def was_received(self) -> bool:
+        """Whether the receiver's modem has something to hand over."""
+        return self.t_rx_s is not None
+
+
+@dataclass(frozen=True, slots=True)
+class _Arrival:
+    """A frame on its way to one receiver, with the draws already made."""
+
+    source: int
+    destination: int
+    t_tx_s: float
+    begins_s: float
+    ends_s: float
+    measured_s: float
+    fate: str
+    frame: bytes
+    echo: bool
+
+
+@dataclass(frozen=True, slots=True)
+class _Interval:
+    """When a node's own transducer is busy, or a frame sounds at it."""
+
+    source: int
+    begins_s: float
+    ends_s: float
+
+
+PURPOSES = ("loss", "spell", "corruption", "damage", "duplication", "noise", "outlier")
+KEEP_S = 120.0
+"""How long past sounds are remembered for collisions; longer than any frame and travel time."""
+
+
+class Water:
+    """The medium between nodes; event driven, deterministic."""
+
+    def __init__(
+        self,
+        settings: WaterSettings,
+        rng: np.random.Generator,
+        position_of: Callable[[int, float], Position],
+        nodes: Sequence[int] = (0, 1),
+    ) -> None:
+        self.settings = settings
+        self.nodes = tuple(nodes)
+        self._position_of = position_of
+        self._seed = int(rng.integers(1 << 62))
+        self._generators: dict[tuple[str, int, int], np.random.Generator] = {}
+        self._is_bad: dict[tuple[int, int], bool] = {}
+        self._own: dict[int, list[_Interval]] = {node: [] for node in self.nodes}
+        self._heard: dict[int, list[_Interval]] = {node: [] for node in self.nodes}
+        self._queue: list[tuple[float, int, _Arrival]] = []
+        self._sequence = 0
+        self._to_bad, self._to_good = _spell_probabilities(settings)
+
+    def airtime_s(self, size_bytes: int) -> float:
+        """Return how long a frame of that size sounds."""
+        return 8.0 * size_bytes / self.settings.rate_bps
+
+    def transmitting_until_s(self, node: int) -> float:
+        """Return when the node's last transmission ends, -inf when there was none."""
+        return self._own[node][-1].ends_s if self._own[node] else -np.inf
+
+    def transmit(
+        self, node: int, now_s: float, frame: bytes, airtime_s: float | None = None
+    ) -> None:
+        """Start a transmission; a modem with its own modulation gives its own airtime.
+
+        Raises
+        ------
+        LocalProtocolError
+            When the node is unknown or still transmitting: its modem has to queue.
+        """
+        if node not in self._own:
+            raise LocalProtocolError(f"node {node} is not in the water; nodes are {self.nodes}")
+        if now_s < self.transmitting_until_s(node):
+            until_s = self.transmitting_until_s(node)
+            raise LocalProtocolError(f"node {node} at {now_s} s still transmits until {until_s} s")
+        duration_s = self.airtime_s(len(frame)) if airtime_s is None else airtime_s
+        self._forget(now_s - KEEP_S)
+        self._own[node].append(_Interval(node, now_s, now_s + duration_s))
+        for destination in self.nodes:
+            if destination != node:
+                self._launch(node, destination, now_s, duration_s, frame)
+
+    def next_delivery_s(self) -> float | None:
+        """Return when the next fate is decided, None when nothing is on its way."""
+        return self._queue[0][0] if self._queue else None
+
+    def deliveries_until(self, time_s: float) -> list[Delivery]:
+        """Return the fates decided up to and including a time, oldest first, lost ones too."""
+        deliveries = []
+        while self._queue and self._queue[0][0] <= time_s:
+            decided_s, _, arrival = heapq.heappop(self._queue)
+            deliveries.append(self._decide(arrival, decided_s))
+        return deliveries
+
+    def travel_time_s(self, source: int, destination: int, t_tx_s: float) -> float:
+        """Return the true travel time of sound that leaves at t_tx_s, both vehicles moving."""
+        origin = np.asarray(self._position_of(source, t_tx_s))
+        travel_s = 0.0
+        for _ in range(3):  # contracts by speed / sound speed, 1e-3, each time
+            target = np.asarray(self._position_of(destination, t_tx_s + travel_s))
+            travel_s = float(np.linalg.norm(target - origin)) / self.settings.sound_speed_mps
+        return travel_s
+
+    def _launch(
+        self, source: int, destination: int, now_s: float, duration_s: float, frame: bytes
+    ) -> None:
+        """Make every draw for one receiver and put the arrival on its way."""
+        settings = self.settings
+        link = (source, destination)
+        travel_s = self.travel_time_s(source, destination, now_s)
+        is_outlier = self._draw("outlier", link).random() < settings.outlier_share
+        noise_m = settings.range_noise_m * self._draw("noise", link).standard_normal()
+        factor = settings.outlier_factor if is_outlier else 1.0
+        measured_s = now_s + factor * travel_s + noise_m / settings.sound_speed_mps
+        is_lost = self._is_lost(link)
+        is_corrupt = self._draw("corruption", link).random() < settings.corruption
+        damaged = self._damage(link, frame)
+        has_echo = self._draw("duplication", link).random() < settings.duplication
+        fate = "lost" if is_lost else "corrupt" if is_corrupt else "delivered"
+        if travel_s * settings.sound_speed_mps > settings.reach_m:
+            fate = "out-of-reach"
+        else:
+            interval = _Interval(source, now_s + travel_s, now_s + travel_s + duration_s)
+            self._heard[destination].append(interval)
+        arrival = _Arrival(
+            source,
+            destination,
+            now_s,
+            now_s + travel_s,
+            now_s + travel_s + duration_s,
+            measured_s,
+            fate,
+            damaged if fate == "corrupt" else frame,
+            has_echo and fate in {"delivered", "corrupt"},
+        )
+        self._push(max(arrival.begins_s, measured_s) + duration_s, arrival)
+
+    def _decide(self, arrival: _Arrival, decided_s: float) -> Delivery:
+        """Return the fate, now that everything that could sound at the same time has begun."""
+        fate = arrival.fate
+        if fate not in {"duplicate", "out-of-reach"}:
+            if _overlaps(arrival, self._own[arrival.destination]):
+                fate = "half-duplex"
+            elif _overlaps(arrival, self._heard[arrival.destination]):
+                fate = "collision"
+        received = fate in {"delivered", "corrupt", "duplicate"}
+        if received and arrival.echo:
+            delay_s = self.settings.echo_delay_s
+            echo = replace(
+                arrival, measured_s=arrival.measured_s + delay_s, fate="duplicate", echo=False
+            )
+            self._push(decided_s + delay_s, echo)
+        return Delivery(
+            source=arrival.source,
+            destination=arrival.destination,
+            t_tx_s=arrival.t_tx_s,
+            t_rx_s=arrival.measured_s if received else None,
+            t_delivered_s=decided_s,
+            frame=arrival.frame,
+            fate=fate,
+        )
+
+    def _is_lost(self, link: tuple[int, int]) -> bool:
+        """Draw a loss, independent or by the Gilbert-Elliott state of this directed link."""
+        settings = self.settings
+        chance = self._draw("loss", link).random()
+        turn = self._draw("spell", link).random()
+        if settings.loss_model == "independent":
+            return bool(chance < settings.loss)
+        if link not in self._is_bad:
+            self._is_bad[link] = bool(turn < settings.loss / settings.bad_state_loss)
+        else:
+            leaves = self._to_good if self._is_bad[link] else self._to_bad
+            self._is_bad[link] ^= bool(turn < leaves)
+        return self._is_bad[link] and bool(chance < settings.bad_state_loss)
+
+    def _damage(self, link: tuple[int, int], frame: bytes) -> bytes:
+        """Return the frame with some bits turned; drawn for every frame, used for few."""
+        rng = self._draw("damage", link)
+        count = int(rng.geometric(1.0 / self.settings.corrupt_bits))
+        positions = rng.integers(0, 1 << 62, size=min(count, 4096))
+        damaged = bytearray(frame)
+        for position in positions % max(8 * len(frame), 1) if frame else ():
+            damaged[position >> 3] ^= 1 << (position & 7)
+        if damaged == frame and damaged:  # an even number of turns of one bit
+            damaged[0] ^= 1
+        return bytes(damaged)
+
+    def _draw(self, purpose: str, link: tuple[int, int]) -> np.random.Generator:
+        key = (purpose, *link)
+        if key not in self._generators:
+            seed = (self._seed, PURPOSES.index(purpose), *link)
+            self._generators[key] = np.random.default_rng(seed)
+        return self._generators[key]
+
+    def _push(self, decided_s: float, arrival: _Arrival) -> None:
+        self._sequence += 1
+        heapq.heappush(self._queue, (decided_s, self._sequence, arrival))
+
+    def _forget(self, before_s: float) -> None:
+        for sounds in (*self._own.values(), *self._heard.values()):
+            while sounds and sounds[0].ends_s < before_s:
+                del sounds[0]
+
+
+def _overlaps(arrival: _Arrival, sounds: list[_Interval]) -> bool:
+    """Return whether any other sound falls into the arrival's time at its receiver."""
+    itself = (arrival.source, arrival.begins_s)
+    return any(
+        sound.begins_s < arrival.ends_s
+        and sound.ends_s > arrival.begins_s
+        and (sound.source, sound.begins_s) != itself
+        for sound in sounds
+    )
+
+
+def _spell_probabilities(settings: WaterSettings) -> tuple[float, float]:
+    """Return the chances per frame to enter and to leave a bad spell.
+
+    The share of bad states is loss / bad_state_loss, and a bad spell lasts burst_frames on average.
+    """
+    if settings.loss_model == "independent":
+        return 0.0, 0.0
+    share_bad = settings.loss / settings.bad_state_loss
+    leaving = 1.0 / settings.burst_frames
+    if share_bad >= 1.0:
+        entering = np.inf
+    else:
+        entering = share_bad * leaving / (1.0 - share_bad)
+    if entering > 1.0:
+        raise ConfigError(
+            f"loss {settings.loss} cannot come in spells of {settings.burst_frames} frames;"
+            f" give burst_frames of at least {share_bad / max(1.0 - share_bad, 1e-9):.1f}"
+        )
+    return entering, leaving

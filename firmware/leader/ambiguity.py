@@ -1,0 +1,130 @@
+"""What the residual error surface says about where the shift may be, and how surely.
+
+Every lattice shift is compared with the hypothesis that the two sub-maps show unrelated seabed.
+Under a match the mean square difference over the overlap is the noise, v, of partly unknown scale;
+under no match it is what it is at shifts chosen blindly, the background b. With n independent
+pieces of relief in the overlap the log evidence is
+
+    n / 2 * [log(b / max(v, E)) - E / max(v, E) + E / b].
+
+It grows with relief and overlap, is zero on a flat seabed, and falls off as a power of E rather
+than exponentially, so that misfit which the noise model does not know cannot crown a small, lucky
+overlap.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from firmware.geometry import Array
+from firmware.leader.screening import ErrorSurface
+
+_LEAST_BACKGROUND = 20  # shifts; fewer say nothing about the background
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Relief:
+    """What sets the scale of the evidence: background and noise, m^2, and independent pieces."""
+
+    background_m2: float
+    noise_m2: float
+    pieces_per_cell: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Posterior:
+    """Probability mass on the lattice shifts (K, L) and outside them (no or too little overlap)."""
+
+    north_m: Array
+    east_m: Array
+    mass: Array
+    outside: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """How much mass lies away from the winner, in the plane and away from its line.
+
+    axis_rad is the direction from north across the line: the one in which the shift is known.
+    """
+
+    false_mass: float
+    axis_rad: float
+    false_mass_off_line: float
+
+
+def background(surface: ErrorSurface, best_m: Array, away_m: float) -> float | None:
+    """Return the median E of shifts further than away_m from the best, None if there are few."""
+    north, east = surface.north_m - best_m[0], surface.east_m - best_m[1]
+    far = north[:, None] ** 2 + east[None, :] ** 2 > away_m**2
+    values = surface.residual_m2[far & np.isfinite(surface.residual_m2)]
+    if values.size < _LEAST_BACKGROUND:
+        return None
+    return float(np.median(values))
+
+
+def log_evidence(residual_m2: Array, overlap_cells: Array, relief: Relief) -> Array:
+    """Return the log Bayes factor of a match over unrelated seabed at each shift."""
+    scale = np.maximum(residual_m2, relief.noise_m2)
+    usable = np.isfinite(residual_m2)
+    error = np.where(usable, residual_m2, 1.0)
+    scale = np.where(usable, scale, 1.0)
+    background_m2 = max(relief.background_m2, relief.noise_m2)
+    gain = np.log(background_m2 / scale) - error / scale + error / background_m2
+    return np.where(usable, 0.5 * overlap_cells * relief.pieces_per_cell * gain, -np.inf)
+
+
+def posterior(
+    surface: ErrorSurface, evidence: Array, prior_m: Array, covariance_m2: Array, null_share: float
+) -> Posterior:
+    """Return the mass of every shift and of `elsewhere`.
+
+    The prior is the graph's Gaussian, of which null_share is spread on nothing: the pose graph may
+    be wrong, and then no shift is right.
+    """
+    cell_m = float(surface.north_m[1] - surface.north_m[0]) if surface.north_m.size > 1 else 1.0
+    spread = covariance_m2 + np.eye(2) * cell_m**2 / 12.0
+    north, east = surface.north_m - prior_m[0], surface.east_m - prior_m[1]
+    inverse = np.linalg.inv(spread)
+    square = (
+        inverse[0, 0] * north[:, None] ** 2
+        + 2.0 * inverse[0, 1] * north[:, None] * east[None, :]
+        + inverse[1, 1] * east[None, :] ** 2
+    )
+    density = np.exp(-0.5 * np.minimum(square, 1400.0))
+    density *= (1.0 - null_share) * cell_m**2 / (2.0 * np.pi * np.sqrt(np.linalg.det(spread)))
+    reachable = np.isfinite(evidence) & (density > 0.0)
+    elsewhere = max(1.0 - float(density[reachable].sum()), null_share)
+    log_mass = np.where(reachable, np.log(np.maximum(density, 1e-300)) + evidence, -np.inf)
+    top = max(float(log_mass.max(initial=-np.inf)), np.log(elsewhere))
+    mass = np.exp(log_mass - top)
+    outside = elsewhere * np.exp(-top)
+    total = float(mass.sum()) + outside
+    return Posterior(
+        north_m=surface.north_m,
+        east_m=surface.east_m,
+        mass=mass / total,
+        outside=outside / total,
+    )
+
+
+def judge(found: Posterior, winner_m: Array, radius_m: float) -> Verdict:
+    """Return the mass outside the winner's basin, and outside the line through it."""
+    north, east = found.north_m - winner_m[0], found.east_m - winner_m[1]
+    square = north[:, None] ** 2 + east[None, :] ** 2
+    inside = float(found.mass[square <= radius_m**2].sum())
+    along_n, along_e = north[:, None], east[None, :]
+    second = np.array(
+        [
+            [np.sum(found.mass * along_n**2), np.sum(found.mass * along_n * along_e)],
+            [np.sum(found.mass * along_n * along_e), np.sum(found.mass * along_e**2)],
+        ]
+    )
+    _, vectors = np.linalg.eigh(second)
+    across = vectors[:, 0]
+    off = np.abs(across[0] * along_n + across[1] * along_e)
+    return Verdict(
+        false_mass=1.0 - inside,
+        axis_rad=float(np.arctan2(across[1], across[0]) % np.pi),
+        false_mass_off_line=1.0 - float(found.mass[off <= radius_m].sum()),
+    )

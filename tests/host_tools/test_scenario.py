@@ -1,0 +1,73 @@
+from pathlib import Path
+
+import pytest
+
+from host_tools.scenario import SCENARIOS, load_scenario, named_scenario
+from protocol.errors import ConfigError
+from protocol.settings import replace
+
+
+def test_paper_1_holds_the_values_of_the_paper() -> None:
+    scenario = named_scenario("paper-1")
+    assert (scenario.duration_min, scenario.follower_duration_min) == (40, 30)
+    assert (scenario.leg_m, scenario.line_spacing_m, scenario.corner_offset_m) == (600, 100, 50)
+    assert scenario.speed_mps == pytest.approx(2.0578, abs=1e-4)
+    assert (scenario.beams, scenario.swath_deg, scenario.ping_hz) == (192, 120, 4)
+    assert (scenario.drift_mean_mps, scenario.drift_variance) == (0.1, 0.04)
+    assert (scenario.loss, scenario.outlier_share, scenario.outlier_factor) == (0.14, 0.2, 1.1)
+    assert scenario.lines == 7
+    assert not scenario.roughness
+    assert scenario.current_mps == scenario.heading_bias_deg == scenario.flier_share == 0
+
+
+def test_other_scenarios_change_only_what_they_state() -> None:
+    paper_2 = named_scenario("paper-2")
+    assert (paper_2.duration_min, paper_2.follower_duration_min, paper_2.leg_m) == (55, 50, 800)
+    field = named_scenario("field-1")
+    assert (field.roll_bias_deg, field.sound_speed_error_mps, field.depth_wander_m) == (0.2, 2, 0.3)
+    assert (field.heading_bias_deg, field.log_scale, field.current_mps) == (0.5, 0.005, 0.2)
+    assert field.roughness
+    assert field.drift_directions_drawn
+    assert named_scenario("day-1").duration_min == 1440
+
+
+def test_every_named_scenario_carries_its_name() -> None:
+    assert all(named_scenario(name).name == name for name in SCENARIOS)
+
+
+def test_toml_file_changes_its_base(tmp_path: Path) -> None:
+    path = tmp_path / "short.toml"
+    path.write_text('base = "paper-2"\nduration_min = 12\nsurvey_north_m = 5\nsurvey_east_m = 6\n')
+    scenario = load_scenario(str(path))
+    assert (scenario.name, scenario.duration_min, scenario.leg_m) == ("short", 12, 800)
+    assert scenario.survey_north_m == 5
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("speed = 3", "unknown key 'speed'; known keys: base, name, duration_min"),
+        ("leg_m = [", "is not a TOML file"),
+        ("leg_m = 1", "at least 20"),
+        ("base = 'paper-3'", "choose one of paper-1, paper-2, field-1, day-1"),
+        ("line_spacing_m = 12", "needs at least 23.6 m"),
+        ("survey_north_m = 12", "give both"),
+    ],
+)
+def test_bad_scenario_file_is_a_clear_error(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "bad.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        load_scenario(str(path))
+
+
+def test_unknown_scenario_names_the_choices() -> None:
+    with pytest.raises(ConfigError, match="paper-1, paper-2, field-1, day-1"):
+        load_scenario("papper-1")
+    with pytest.raises(ConfigError, match="cannot read scenario"):
+        load_scenario("missing.toml")
+
+
+def test_setting_survey_position_as_text_pairs_both() -> None:
+    changed = replace(named_scenario("paper-1"), {"loss": "0.3", "survey_north_m": "none"})
+    assert (changed.loss, changed.survey_north_m) == (0.3, None)

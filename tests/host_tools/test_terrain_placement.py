@@ -1,0 +1,171 @@
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from affine import Affine
+
+from host_tools.scenario import named_scenario
+from host_tools.simulator.placement import place_survey
+from host_tools.simulator.roughness import roughen
+from host_tools.simulator.seabed import Seabed
+from host_tools.simulator.terrain import open_terrain
+from protocol.errors import ConfigError
+from protocol.settings import replace
+
+PAPER = named_scenario("paper-1")
+
+
+def write_raster(
+    path: Path, elevation_m: np.ndarray, cell_m: float = 5.0, crs: str | None = "EPSG:32619"
+) -> Path:
+    with rasterio.open(
+        path,
+        "w",
+        driver="GTiff",
+        height=elevation_m.shape[0],
+        width=elevation_m.shape[1],
+        count=1,
+        dtype="float32",
+        crs=crs,
+        transform=Affine(cell_m, 0.0, 350_000.0, 0.0, -cell_m, 4_680_000.0),
+        nodata=-9999.0,
+    ) as dataset:
+        dataset.write(elevation_m.astype("float32"), 1)
+    return path
+
+
+def slope(rows: int = 300, columns: int = 300) -> np.ndarray:
+    return -20.0 - 0.02 * np.add.outer(np.arange(rows), np.arange(columns))
+
+
+def test_mission_depth_is_shift_minus_elevation_at_the_same_place(tmp_path: Path) -> None:
+    path = write_raster(tmp_path / "slope.tif", slope())
+    site = place_survey(open_terrain(path), PAPER, 1)
+    with rasterio.open(path) as dataset:
+        east_m, north_m = 350_000.0 + 130.5 * 5.0, 4_680_000.0 - 150.5 * 5.0
+        expected = site.datum.depth_shift_m - dataset.read(1)[150, 130]
+    depth = site.seabed.depth_at(
+        np.array([north_m - site.datum.origin_north_m]),
+        np.array([east_m - site.datum.origin_east_m]),
+    )
+    assert depth[0] == pytest.approx(expected, abs=1e-3)
+
+
+def test_mean_altitude_is_forty_metres(tmp_path: Path) -> None:
+    site = place_survey(open_terrain(write_raster(tmp_path / "a.tif", slope())), PAPER, 1)
+    box = site.footprint
+    north_m, east_m = np.meshgrid(
+        np.arange(box.south_m, box.north_m, 5), np.arange(box.west_m, box.east_m, 5)
+    )
+    altitude_m = site.seabed.depth_at(north_m.ravel(), east_m.ravel()) - PAPER.vehicle_depth_m
+    assert np.nanmean(altitude_m) == pytest.approx(40.0, abs=0.2)
+
+
+def test_a_pinnacle_raises_the_mean_so_that_no_altitude_is_under_fifteen(tmp_path: Path) -> None:
+    elevation_m = slope()
+    elevation_m[148:152, 148:152] = 20.0
+    chosen = replace(PAPER, {"survey_north_m": 4_678_900, "survey_east_m": 350_400})
+    site = place_survey(open_terrain(write_raster(tmp_path / "a.tif", elevation_m)), chosen, 1)
+    assert site.minimum_altitude_m == pytest.approx(15.0)
+    assert site.mean_altitude_m > 40.0
+
+
+def test_survey_lies_where_the_settings_say(tmp_path: Path) -> None:
+    chosen = replace(PAPER, {"survey_north_m": 4_678_900, "survey_east_m": 350_200})
+    site = place_survey(open_terrain(write_raster(tmp_path / "a.tif", slope())), chosen, 1)
+    assert (site.datum.origin_north_m, site.datum.origin_east_m) == (4_678_900, 350_200)
+
+
+def test_survey_avoids_the_part_without_data(tmp_path: Path) -> None:
+    elevation_m = slope(400, 400)
+    elevation_m[:, :180] = -9999.0
+    site = place_survey(open_terrain(write_raster(tmp_path / "a.tif", elevation_m)), PAPER, 1)
+    assert site.data_share > 0.98
+    assert site.datum.origin_east_m + site.footprint.west_m > 350_000 + 5 * 180 - 25
+
+
+def test_depths_stored_positive_down_are_turned_over(tmp_path: Path) -> None:
+    up = place_survey(open_terrain(write_raster(tmp_path / "u.tif", slope())), PAPER, 1)
+    down = place_survey(open_terrain(write_raster(tmp_path / "d.tif", -slope())), PAPER, 1)
+    np.testing.assert_array_equal(up.seabed.depth_m, down.seabed.depth_m)
+
+
+def test_not_a_raster_is_a_clear_error(tmp_path: Path) -> None:
+    path = tmp_path / "notes.tif"
+    path.write_text("soundings to follow")
+    with pytest.raises(ConfigError, match="cannot be read as a raster"):
+        open_terrain(path)
+    with pytest.raises(ConfigError, match="is not a file"):
+        open_terrain(tmp_path / "missing.tif")
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+@pytest.mark.parametrize("crs", [None, "EPSG:4326"])
+def test_terrain_without_projected_system_is_a_clear_error(tmp_path: Path, crs: str | None) -> None:
+    path = write_raster(tmp_path / "a.tif", slope(), crs=crs)
+    with pytest.raises(ConfigError, match=r"projected|coordinate reference system"):
+        open_terrain(path)
+
+
+def test_terrain_in_feet_is_a_clear_error(tmp_path: Path) -> None:
+    path = write_raster(tmp_path / "a.tif", slope(), crs="EPSG:2263")
+    with pytest.raises(ConfigError, match="not in metres"):
+        open_terrain(path)
+
+
+def test_terrain_of_no_data_is_a_clear_error(tmp_path: Path) -> None:
+    path = write_raster(tmp_path / "a.tif", np.full((200, 200), -9999.0))
+    with pytest.raises(ConfigError, match="every cell is no-data"):
+        open_terrain(path)
+
+
+def test_terrain_too_small_names_both_sizes(tmp_path: Path) -> None:
+    path = write_raster(tmp_path / "a.tif", slope(60, 60))
+    with pytest.raises(ConfigError, match=r"300 x 300 m .* needs 700 x 700 m"):
+        place_survey(open_terrain(path), PAPER, 1)
+
+
+def test_survey_off_the_terrain_is_a_clear_error(tmp_path: Path) -> None:
+    chosen = replace(PAPER, {"survey_north_m": 0, "survey_east_m": 0})
+    with pytest.raises(ConfigError, match="outside terrain"):
+        place_survey(open_terrain(write_raster(tmp_path / "a.tif", slope())), chosen, 1)
+
+
+def test_roughness_keeps_the_terrain_and_adds_only_short_waves() -> None:
+    rng = np.random.default_rng(3)
+    size = 128
+    wave = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None, :])
+    wave[0, 0] = np.inf
+    depth_m = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((size, size))) * wave**-1.5)
+    depth_m = 50 + 3 * depth_m / depth_m.std()
+    coarse = Seabed(depth_m, 0.0, 0.0, 5.0, 5.0)
+    fine = roughen(coarse, np.random.default_rng(1))
+    again = roughen(coarse, np.random.default_rng(1))
+    assert fine.cell_north_m == 1.0
+    np.testing.assert_array_equal(fine.depth_m, again.depth_m)
+    north_m, east_m = np.meshgrid(np.arange(50.0, 550.0), np.arange(50.0, 550.0), indexing="ij")
+    added_m = fine.depth_at(north_m, east_m) - coarse.depth_at(north_m, east_m)
+    assert 0.01 < added_m.std() < 0.5
+    smooth_m = added_m.reshape(25, 20, 25, 20).mean(axis=(1, 3))
+    assert smooth_m.std() < 0.15 * added_m.std()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "massbay_west_5m.tif",
+        "medes_islands_10m.tif",
+        "flat_shelf_2m.bag",
+        "portsmouth_ripples_50cm.bag",
+    ],
+)
+def test_real_terrain_holds_a_survey(name: str) -> None:
+    folder = os.environ.get("FATHOMLINK_DATA")
+    if not folder:
+        pytest.skip("FATHOMLINK_DATA is not set")
+    changes = {"leg_m": 200, "line_spacing_m": 60} if "ripples" in name else {}
+    site = place_survey(open_terrain(Path(folder) / "terrain" / name), replace(PAPER, changes), 1)
+    assert site.data_share > 0.7
+    assert site.minimum_altitude_m >= 15.0 - 1e-6

@@ -1,13 +1,13 @@
 """Scenarios: what is surveyed, by whom, with which errors, so that figures compare."""
 
-import dataclasses
 import math
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from protocol.acoustics import WaterSettings
 from protocol.errors import ConfigError
-from protocol.settings import Settings, replace, setting
+from protocol.settings import Settings, flatten, replace, setting
 
 KNOT_MPS = 1852.0 / 3600.0
 
@@ -106,24 +106,7 @@ class ScenarioSettings(Settings):
     )
     current_period_min: float = setting(60.0, "min", "one turn of the current", minimum=1.0)
 
-    loss: float = setting(
-        0.14, "", "share of frames lost per receiver, both directions", minimum=0.0, maximum=1.0
-    )
-    loss_model: str = setting(
-        "independent", "", "bursty: Gilbert-Elliott", choices=("independent", "bursty")
-    )
-    burst_frames: float = setting(
-        4.0, "frames", "mean length of a burst of losses", minimum=1.0, maximum=1000.0
-    )
-    range_sigma_m: float = setting(1.0, "m", "Eq. 13", minimum=0.0, maximum=100.0)
-    outlier_share: float = setting(
-        0.2,
-        "",
-        "ranges scaled by outlier_factor; Eq. 14 to the letter: 0.8",
-        minimum=0.0,
-        maximum=1,
-    )
-    outlier_factor: float = setting(1.1, "", "Eq. 14", minimum=0.5, maximum=2.0)
+    water: WaterSettings = field(default_factory=WaterSettings)
 
     @property
     def lines(self) -> int:
@@ -210,9 +193,13 @@ def load_scenario(name_or_path: str) -> ScenarioSettings:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is not a TOML file: {error}") from error
     base = named_scenario(str(table.pop("base", "paper-1")))
-    known = [field.name for field in dataclasses.fields(ScenarioSettings)]
+    water = table.pop("water", {})
+    if not isinstance(water, dict):
+        raise ConfigError(f"{path}: water is {water!r}; write its keys under [water]")
+    table |= {f"water.{key}": value for key, value in water.items()}
+    known = [key for key, *_ in flatten(base)]
     for key in table:
-        if key not in known:
+        if key not in known and f"water.{key}" not in known:
             raise ConfigError(f"{path}: unknown key {key!r}; known keys: base, {', '.join(known)}")
     scenario = replace(base, {"name": path.stem, **table})
     scenario.check()

@@ -75,9 +75,7 @@ class Multibeam:
         directions = _beam_directions(poses.roll_rad, poses, self.angles_rad)
         origin = np.stack([poses.north_m, poses.east_m, poses.depth_m])
         points_m: Array = (origin[:, :, None] + directions * ranges_m).reshape(3, -1).T
-        good: NDArray[np.bool_] = np.isfinite(ranges_m).ravel()
-        soundings_m: Array = points_m[good]
-        return soundings_m
+        return points_m[np.isfinite(ranges_m).ravel()]
 
 
 def _beam_directions(roll_rad: Array, poses: Poses, angles_rad: Array) -> Array:
@@ -130,7 +128,8 @@ def cast_rays(seabed: Seabed, poses: Poses, directions: Array) -> Array:
         origin[0][rays] + hit_m * d_north[rays], origin[1][rays] + hit_m * d_east[rays]
     )
     ranges_m[rays[np.isnan(known)]] = np.nan
-    return ranges_m.reshape(shape)
+    distances_m: Array = ranges_m.reshape(shape)
+    return distances_m
 
 
 def _reach(seabed: Seabed, poses: Poses, across_per_down: Array) -> float:

@@ -11,10 +11,11 @@ def test_paper_1_holds_the_values_of_the_paper() -> None:
     scenario = named_scenario("paper-1")
     assert (scenario.duration_min, scenario.follower_duration_min) == (40, 30)
     assert (scenario.leg_m, scenario.line_spacing_m, scenario.corner_offset_m) == (600, 100, 50)
+    water = scenario.water
     assert scenario.speed_mps == pytest.approx(2.0578, abs=1e-4)
     assert (scenario.beams, scenario.swath_deg, scenario.ping_hz) == (192, 120, 4)
     assert (scenario.drift_mean_mps, scenario.drift_variance) == (0.1, 0.04)
-    assert (scenario.loss, scenario.outlier_share, scenario.outlier_factor) == (0.14, 0.2, 1.1)
+    assert (water.loss, water.outlier_share, water.outlier_factor) == (0.14, 0.2, 1.1)
     assert scenario.lines == 7
     assert not scenario.roughness
     assert scenario.current_mps == scenario.heading_bias_deg == scenario.flier_share == 0
@@ -37,10 +38,13 @@ def test_every_named_scenario_carries_its_name() -> None:
 
 def test_toml_file_changes_its_base(tmp_path: Path) -> None:
     path = tmp_path / "short.toml"
-    path.write_text('base = "paper-2"\nduration_min = 12\nsurvey_north_m = 5\nsurvey_east_m = 6\n')
+    path.write_text(
+        'base = "paper-2"\nduration_min = 12\n'
+        "survey_north_m = 5\nsurvey_east_m = 6\n[water]\nloss = 0.5\n"
+    )
     scenario = load_scenario(str(path))
     assert (scenario.name, scenario.duration_min, scenario.leg_m) == ("short", 12, 800)
-    assert scenario.survey_north_m == 5
+    assert (scenario.survey_north_m, scenario.water.loss) == (5, 0.5)
 
 
 @pytest.mark.parametrize(
@@ -70,4 +74,4 @@ def test_unknown_scenario_names_the_choices() -> None:
 
 def test_setting_survey_position_as_text_pairs_both() -> None:
     changed = replace(named_scenario("paper-1"), {"loss": "0.3", "survey_north_m": "none"})
-    assert (changed.loss, changed.survey_north_m) == (0.3, None)
+    assert (changed.water.loss, changed.survey_north_m) == (0.3, None)

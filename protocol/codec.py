@@ -54,12 +54,14 @@ def encode(packet: Packet) -> bytes:
     """
     header = packet.header
     body = encode_body(packet)
-    if isinstance(packet, SealedFrame):
-        body += _COUNTER.pack(packet.counter) + packet.tag
-    if HEADER_BYTES + len(body) + CRC_BYTES != SIZE_BYTES[header.profile]:
+    if len(body) != BODY_BYTES[header.profile]:
         raise LocalProtocolError(
             f"a {header.profile.name} body has {BODY_BYTES[header.profile]} bytes, not {len(body)}"
         )
+    if isinstance(packet, SealedFrame):
+        body += _COUNTER.pack(packet.counter) + packet.tag
+    if len(body) != SIZE_BYTES[header.profile] - HEADER_BYTES - CRC_BYTES:
+        raise LocalProtocolError(f"only a sealed frame is sent as {header.profile.name}")
     return with_crc(encode_header(header) + body)
 
 

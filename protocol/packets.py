@@ -1,7 +1,7 @@
 """What the vehicles tell each other: one frozen dataclass per packet; WIRE.md has the bytes."""
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import ClassVar
 
 import numpy as np
@@ -140,7 +140,7 @@ class _BitwiseEqual:
     __slots__ = ()
 
     def _key(self) -> tuple[object, ...]:
-        values = (getattr(self, name) for name in self.__dataclass_fields__)  # type: ignore[attr-defined]
+        values = (getattr(self, field.name) for field in fields(self))  # type: ignore[arg-type]
         return tuple(v.tobytes() if isinstance(v, np.ndarray) else v for v in values)
 
     def __eq__(self, other: object) -> bool:

@@ -14,8 +14,6 @@ from protocol.modems.base import LinkNotice, Modem, ModemContext, Reception
 from protocol.modems.loopback import LoopbackMedium
 from protocol.modems.registry import open_modem
 
-QUIET = {"loss": 0.0, "outlier_share": 0.0}
-
 
 class Channel(Protocol):
     """Two ends, and a clock that can be moved."""
@@ -125,7 +123,7 @@ def channel(request: pytest.FixtureRequest) -> Iterator[Channel]:
     elif request.param == "lossy":
         yield LoopbackChannel(WaterSettings(loss=0.3, outlier_share=0.0))
     elif request.param == "delayed":
-        yield LoopbackChannel(WaterSettings(loss=0.0), range_m=9_000.0)
+        yield LoopbackChannel(WaterSettings(loss=0.0, outlier_share=0.0), range_m=9_000.0)
     else:
         yield LoopbackChannel(WaterSettings(loss=0.0))
 

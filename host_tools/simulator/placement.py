@@ -46,12 +46,31 @@ class Box:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Window:
+    """The part of the terrain's grid under the survey and around it.
+
+    Its cell (0, 0) is the south-western one, with centre (north0_m, east0_m) in NED; top_row and
+    left_column say where its north-western cell lies in the file.
+    """
+
+    top_row: int
+    left_column: int
+    rows: int
+    columns: int
+    north0_m: float
+    east0_m: float
+    cell_north_m: float
+    cell_east_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Site:
     """A seabed to survey, where it lies, and what the placement found."""
 
     seabed: Seabed
     datum: Datum
     raster: Raster
+    window: Window
     data_share: float
     mean_altitude_m: float
     minimum_altitude_m: float
@@ -79,7 +98,7 @@ def place_survey(raster: Raster, scenario: ScenarioSettings, seed: int) -> Site:
         corner = (scenario.survey_north_m, scenario.survey_east_m)
     else:
         corner = _best_corner(raster, scenario, tracks, footprint)
-    elevation_m, north0_m, east0_m = _window(raster, corner, footprint, 0.0)
+    elevation_m = _read(raster, _window(raster, corner, footprint))
     share = float(np.isfinite(elevation_m).mean()) * _inside_share(raster, corner, footprint)
     if not share >= LEAST_DATA_SHARE:
         raise ConfigError(
@@ -91,10 +110,13 @@ def place_survey(raster: Raster, scenario: ScenarioSettings, seed: int) -> Site:
     shift_m = scenario.vehicle_depth_m + max(
         scenario.altitude_m - mean_m, scenario.minimum_altitude_m - shallowest_m
     )
-    wide = MARGIN_ALTITUDES * scenario.altitude_m
-    elevation_m, north0_m, east0_m = _window(raster, corner, footprint, wide)
+    window = _window(raster, corner, footprint.grown(MARGIN_ALTITUDES * scenario.altitude_m))
     seabed = Seabed(
-        shift_m - elevation_m, north0_m, east0_m, raster.cell_north_m, raster.cell_east_m
+        shift_m - _read(raster, window),
+        window.north0_m,
+        window.east0_m,
+        window.cell_north_m,
+        window.cell_east_m,
     )
     if scenario.roughness:
         seabed = roughen(seabed, np.random.default_rng([seed, 0x20C4]))
@@ -107,6 +129,7 @@ def place_survey(raster: Raster, scenario: ScenarioSettings, seed: int) -> Site:
             depth_shift_m=shift_m,
         ),
         raster=raster,
+        window=window,
         data_share=share,
         mean_altitude_m=mean_m + shift_m - scenario.vehicle_depth_m,
         minimum_altitude_m=shallowest_m + shift_m - scenario.vehicle_depth_m,
@@ -204,29 +227,36 @@ def _box_minima(values: Array, size: tuple[int, int]) -> Array:
     return minima[: values.shape[0] - size[0] + 1, : values.shape[1] - size[1] + 1]
 
 
-def _window(
-    raster: Raster, corner: tuple[float, float], box: Box, margin_m: float
-) -> tuple[Array, float, float]:
-    """Return elevations of the box, row 0 southernmost, and its first cell's north and east."""
-    box = box.grown(margin_m)
+def _window(raster: Raster, corner: tuple[float, float], box: Box) -> Window:
+    """Return the terrain's cells within the box, cut at the terrain's edge."""
     west_m, top_m = raster.transform.c, raster.transform.f
-    first_column = int(np.floor((corner[1] + box.west_m - west_m) / raster.cell_east_m))
-    last_column = int(np.ceil((corner[1] + box.east_m - west_m) / raster.cell_east_m))
-    first_row = int(np.floor((top_m - corner[0] - box.north_m) / raster.cell_north_m))
-    last_row = int(np.ceil((top_m - corner[0] - box.south_m) / raster.cell_north_m))
-    first_row, first_column = max(first_row, 0), max(first_column, 0)
-    last_row, last_column = min(last_row, raster.rows), min(last_column, raster.columns)
-    if last_row - first_row < 2 or last_column - first_column < 2:
+    left = math.floor((corner[1] + box.west_m - west_m) / raster.cell_east_m)
+    right = math.ceil((corner[1] + box.east_m - west_m) / raster.cell_east_m)
+    top = math.floor((top_m - corner[0] - box.north_m) / raster.cell_north_m)
+    bottom = math.ceil((top_m - corner[0] - box.south_m) / raster.cell_north_m)
+    top, left = max(top, 0), max(left, 0)
+    bottom, right = min(bottom, raster.rows), min(right, raster.columns)
+    if bottom - top < 2 or right - left < 2:
         raise ConfigError(
             f"the survey at northing {corner[0]:.0f}, easting {corner[1]:.0f} lies outside terrain "
             f"{raster.name}; choose survey_north_m and survey_east_m within it"
         )
-    elevation_m = raster.read(
-        first_row, first_column, last_row - first_row, last_column - first_column
+    return Window(
+        top_row=top,
+        left_column=left,
+        rows=bottom - top,
+        columns=right - left,
+        north0_m=top_m - (bottom - 0.5) * raster.cell_north_m - corner[0],
+        east0_m=west_m + (left + 0.5) * raster.cell_east_m - corner[1],
+        cell_north_m=raster.cell_north_m,
+        cell_east_m=raster.cell_east_m,
     )
-    north0_m = top_m - (last_row - 0.5) * raster.cell_north_m - corner[0]
-    east0_m = west_m + (first_column + 0.5) * raster.cell_east_m - corner[1]
-    return elevation_m[::-1].astype(np.float64), float(north0_m), float(east0_m)
+
+
+def _read(raster: Raster, window: Window) -> Array:
+    """Return the elevations of the window, row 0 southernmost."""
+    elevation_m = raster.read(window.top_row, window.left_column, window.rows, window.columns)
+    return elevation_m[::-1].astype(np.float64)
 
 
 def _inside_share(raster: Raster, corner: tuple[float, float], box: Box) -> float:

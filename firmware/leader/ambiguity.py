@@ -1,11 +1,12 @@
 """What the residual error surface says about where the shift may be, and how surely.
 
 Every lattice shift is compared with the hypothesis that the two sub-maps show unrelated seabed.
-Under a match the mean square difference over the overlap is the noise, v, of partly unknown scale;
-under no match it is what it is at shifts chosen blindly, the background b. With n independent
-pieces of relief in the overlap the log evidence is
+Let x = E / v be the mean square difference over the overlap in units of the noise there. Under a
+match x is about 1, of partly unknown scale; under no match it is what it is at shifts chosen
+blindly, the background b. With I the information per cell that the relief's spectrum offers
+(`relief`), the log evidence of N cells is
 
-    n / 2 * [log(b / max(v, E)) - E / max(v, E) + E / b].
+    N I f(x) / f(1),  f(x) = log(b / max(1, x)) - x / max(1, x) + x / b  for x < b, else 0.
 
 It grows with relief and overlap, is zero on a flat seabed, and falls off as a power of E rather
 than exponentially, so that misfit which the noise model does not know cannot crown a small, lucky
@@ -22,13 +23,20 @@ from firmware.leader.screening import ErrorSurface
 _LEAST_BACKGROUND = 20  # shifts; fewer say nothing about the background
 
 
+_LEAST_GAIN = 0.3  # f(1) of a background of 2.3; below it the surface hardly has a minimum
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Relief:
-    """What sets the scale of the evidence: background and noise, m^2, and independent pieces."""
+    """What sets the scale of the evidence.
 
-    background_m2: float
-    noise_m2: float
-    pieces_per_cell: float
+    background is the median of x; information_per_cell that of the relief; noise_scale how far the
+    best match exceeds the noise model, by which all others are measured too.
+    """
+
+    background: float
+    information_per_cell: float
+    noise_scale: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,24 +62,28 @@ class Verdict:
 
 
 def background(surface: ErrorSurface, best_m: Array, away_m: float) -> float | None:
-    """Return the median E of shifts further than away_m from the best, None if there are few."""
+    """Return the median E / noise of shifts beyond away_m of the best, None if there are few."""
     north, east = surface.north_m - best_m[0], surface.east_m - best_m[1]
     far = north[:, None] ** 2 + east[None, :] ** 2 > away_m**2
-    values = surface.residual_m2[far & np.isfinite(surface.residual_m2)]
-    if values.size < _LEAST_BACKGROUND:
+    far &= np.isfinite(surface.residual_m2)
+    if np.count_nonzero(far) < _LEAST_BACKGROUND:
         return None
-    return float(np.median(values))
+    return float(np.median(surface.residual_m2[far] / surface.noise_m2[far]))
 
 
-def log_evidence(residual_m2: Array, overlap_cells: Array, relief: Relief) -> Array:
+def log_evidence(
+    residual_m2: Array, noise_m2: Array, overlap_cells: Array, relief: Relief
+) -> Array:
     """Return the log Bayes factor of a match over unrelated seabed at each shift."""
-    scale = np.maximum(residual_m2, relief.noise_m2)
     usable = np.isfinite(residual_m2)
-    error = np.where(usable, residual_m2, 1.0)
-    scale = np.where(usable, scale, 1.0)
-    background_m2 = max(relief.background_m2, relief.noise_m2)
-    gain = np.log(background_m2 / scale) - error / scale + error / background_m2
-    return np.where(usable, 0.5 * overlap_cells * relief.pieces_per_cell * gain, -np.inf)
+    limit = max(relief.background / relief.noise_scale, 1.0)
+    noise_m2 = noise_m2 * relief.noise_scale
+    error = np.minimum(np.where(usable, residual_m2 / noise_m2, limit), limit)
+    scale = np.maximum(error, 1.0)
+    gain = np.log(limit / scale) - error / scale + error / limit
+    best = max(np.log(limit) - 1.0 + 1.0 / limit, _LEAST_GAIN)
+    share = np.minimum(np.maximum(gain, 0.0) / best, 1.0)
+    return np.where(usable, overlap_cells * relief.information_per_cell * share, -np.inf)
 
 
 def posterior(

@@ -1,142 +1,34 @@
 """Matching of two sub-maps: Eq. (8) and (10), what they leave open, and how sure the answer is."""
 
-import enum
-from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from firmware.geometry import Array
 from firmware.leader import ambiguity
-from firmware.leader.refinement import NoiseModel, Refined, refine, slopes
+from firmware.leader.alignment import Aligned, NoiseModel, fields_of
+from firmware.leader.covariance import Refined, measure
+from firmware.leader.matches import Match, MatchingSettings, MatchOutcome, NoMatch
+from firmware.leader.refinement import refine
+from firmware.leader.relief import information_per_cell
 from firmware.leader.screening import ErrorSurface, Layer, error_at, error_surface, prepare
 from firmware.submaps import GriddedSubmap
 from protocol.errors import EstimationError
-from protocol.settings import Settings, setting
 
+_NEGLIGIBLE = 1e-6  # mass beside the best lattice shift's that is not worth refining
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MatchingSettings(Settings):
-    """How sub-maps are matched and when a match becomes a closure."""
-
-    residual: str = setting(
-        "squared",
-        "",
-        "the 0.02 of the paper lies above the noise only on the squared reading",
-        choices=("squared", "absolute"),
-    )
-    residual_limit: float = setting(0.02, "m^2 or m", "the paper's threshold on E", minimum=0.0)
-    residual_noise_ratio: float = setting(
-        2.5, "", "E may be this many times the predicted noise where that is larger", minimum=0.0
-    )
-    minimum_overlap_m2: float = setting(
-        480.0, "m^2", "the paper's N_T = 120 points of 2 m cells", minimum=0.0
-    )
-    search_sigmas: float = setting(3.0, "", "99 % of the prior's mass", minimum=1.0)
-    search_cap_m: float = setting(200.0, "m", "beyond it sub-maps do not meet", minimum=1.0)
-    candidates: int = setting(200, "", "lattice shifts looked at more closely", minimum=1)
-    basins: int = setting(4, "", "separate minima refined below the cell", minimum=1)
-    depth_offset_sigma_m: float = setting(
-        0.3, "m", "tide and datum between passes; 0 is the paper's absolute depth", minimum=0.0
-    )
-    tilt_sigma: float = setting(
-        0.004, "m/m", "roll bias of 0.2 degree seen from both sides", minimum=0.0
-    )
-    bend_sigma_per_m: float = setting(
-        4e-5, "1/m", "a smile of 0.15 m at the edge of a 60 m swath", minimum=0.0
-    )
-    drift_sigma_mps: float = setting(
-        0.03, "m/s", "drift within a sub-map that is left after its removal", minimum=0.0
-    )
-    walk_m2_per_s: float = setting(
-        0.04, "m^2/s", "Eq. 12: variance 0.04 a second and axis", minimum=0.0
-    )
-    cell_sigma_m: float = setting(
-        0.02, "m", "gridding and sub-cell relief beside the sounding noise", minimum=0.001
-    )
-    position_sigma_m: float = setting(
-        0.5, "m", "heading noise and wandering inside a sub-map, felt on slopes", minimum=0.0
-    )
-    correlation_m: float = setting(
-        8.0, "m", "spacing of 150 pseudo points on a sub-map", minimum=0.1
-    )
-    correlated_share: float = setting(
-        0.5, "", "of a reconstruction's variance that neighbours share", minimum=0.0, maximum=1.0
-    )
-    basin_m: float = setting(5.0, "m", "further off a closure is called invalid", minimum=0.1)
-    false_mass_limit: float = setting(
-        0.05, "", "posterior mass that may lie outside the winner's basin", minimum=0.0, maximum=1.0
-    )
-    null_share: float = setting(
-        0.01, "", "chance that the graph's prior is wrong altogether", minimum=0.0, maximum=1.0
-    )
-    evidence_limit: float = setting(
-        3.0, "", "log evidence of the relief alone, whatever the prior says", minimum=0.0
-    )
-    sigma_limit_m: float = setting(
-        2.5, "m", "a weaker shift could not be told from an invalid one", minimum=0.0
-    )
-    covariance_scale: float = setting(
-        1.0, "", "from simulated pairs, so that NEES is 2", minimum=0.1
-    )
-    slope_smoothing_cells: float = setting(
-        1.0, "cells", "keeps sounding noise out of the slopes", minimum=0.1
-    )
-
-
-class NoMatch(enum.Enum):
-    """Why two sub-maps gave no closure."""
-
-    EMPTY = "a grid has no known cell"
-    NO_OVERLAP = "no shift of the search window has enough overlap"
-    FEATURELESS = "too little relief to tell a match from chance"
-    RESIDUAL = "the least residual error is above the threshold"
-    AMBIGUOUS = "another shift explains the data nearly as well"
-    LOOSE = "the minimum is too wide in both directions"
-    UNSETTLED = "no minimum could be refined below the cell"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Match:
-    """A shift to add to the query's NED coordinates so that it lies on the reference.
-
-    The shift holds between the reference's instant and the query's; by default these are the
-    mean times at which the overlap was measured. covariance_m2 (2, 2) is the measurement's own,
-    without the prior. axis_deg is None, or the direction from north in which a one-axis closure
-    holds; across it the covariance is wide. false_mass is the posterior probability that the true
-    shift lies outside the winner's basin (outside its line, for one axis).
-    """
-
-    shift_m: Array
-    covariance_m2: Array
-    residual: float
-    overlap_cells: int
-    depth_offset_m: float
-    axis_deg: float | None
-    false_mass: float
-    log_evidence: float
-    misfit: float
-    variance_m2: float
-    reference_time_s: float
-    query_time_s: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MatchOutcome:
-    """A match, or the reason why there is none."""
-
-    match: Match | None
-    reason: NoMatch | None
+__all__ = ["Match", "MatchOutcome", "MatchingSettings", "NoMatch", "match"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Candidate:
-    """A refined minimum with its E, log evidence and log posterior."""
+    """A refined minimum with its E, overlap and noise there, and the prior's log density."""
 
-    refined: Refined
+    field: Aligned
     residual_m2: float
-    evidence: float
-    score: float
+    overlap_cells: int
+    noise_m2: float
+    log_prior: float
 
 
 def match(
@@ -163,14 +55,25 @@ def match(
         When the grids differ in cell size or the prior is not a covariance.
     """
     _check(reference, query, prior_covariance_m2)
-    layer_r = prepare(reference, reconstructed=reference_reconstructed)
-    layer_q = prepare(query, reconstructed=query_reconstructed)
+    layer_r, layer_q = (
+        prepare(
+            grid,
+            reconstructed=reconstructed,
+            cell_sigma_m=settings.cell_sigma_m,
+            position_sigma_m=settings.position_sigma_m,
+        )
+        for grid, reconstructed in (
+            (reference, reference_reconstructed),
+            (query, query_reconstructed),
+        )
+    )
     if layer_r is None or layer_q is None:
         return _none(NoMatch.EMPTY)
     noise = _noise_model(settings, reconstructed=reference_reconstructed or query_reconstructed)
-    slope2 = 0.5 * (_mean_slope2(layer_r) + _mean_slope2(layer_q))
-    noise_m2 = _mean_variance(layer_r) + _mean_variance(layer_q) + settings.cell_sigma_m**2
-    noise_m2 += settings.position_sigma_m**2 * slope2
+    noise_m2 = _mean_noise(layer_r) + _mean_noise(layer_q)
+    shared_m2 = settings.correlated_share * (
+        reference_reconstructed * _mean_noise(layer_r) + query_reconstructed * _mean_noise(layer_q)
+    )
     offset_m2 = settings.depth_offset_sigma_m**2
     problem = _Problem(
         reference=layer_r,
@@ -182,18 +85,9 @@ def match(
         minimum_cells=settings.minimum_overlap_m2 / query.cell_m**2,
         ridge_cells=noise_m2 / offset_m2 if offset_m2 > 0.0 else np.inf,
         noise_m2=noise_m2,
-        slope2=slope2,
+        shared_m2=shared_m2,
     )
     return _search(problem, times_s)
-
-
-def count_reasons(outcomes: Iterable[MatchOutcome]) -> dict[NoMatch, int]:
-    """Return how often each reason occurred."""
-    counts = dict.fromkeys(NoMatch, 0)
-    for outcome in outcomes:
-        if outcome.reason is not None:
-            counts[outcome.reason] += 1
-    return counts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -209,7 +103,7 @@ class _Problem:
     minimum_cells: float
     ridge_cells: float
     noise_m2: float
-    slope2: float
+    shared_m2: float
 
 
 def _search(problem: _Problem, times_s: tuple[float | None, float | None]) -> MatchOutcome:
@@ -223,17 +117,42 @@ def _search(problem: _Problem, times_s: tuple[float | None, float | None]) -> Ma
     relief = _relief(whole, surface, problem)
     if relief is None:
         return _none(NoMatch.FEATURELESS)
-    evidence = ambiguity.log_evidence(surface.residual_m2, surface.overlap_cells, relief)
-    found = _posterior(surface, evidence, problem)
-    candidates = _refine_best(surface, found, relief, problem, times_s)
+    found = _posterior(surface, _evidence(surface, relief), problem)
+    candidates = _refine_best(surface, found, problem, times_s)
     if not candidates:
         return _none(NoMatch.UNSETTLED)
-    for candidate in candidates:
-        row, col = _nearest(surface, candidate.refined.shift_m)
-        evidence[row, col] = max(evidence[row, col], candidate.evidence)
-    winner = max(candidates, key=lambda candidate: candidate.score)
+    least = min(candidate.residual_m2 / candidate.noise_m2 for candidate in candidates)
+    relief = replace(
+        relief,
+        noise_scale=max(1.0, least),
+        information_per_cell=_information(problem, max(1.0, least)),
+    )
+    evidence = _evidence(surface, relief)
+    refined = [_evidence_at(candidate, relief) for candidate in candidates]
+    for candidate, value in zip(candidates, refined, strict=True):
+        row, col = _nearest(surface, candidate.field.shift_m)
+        evidence[row, col] = max(evidence[row, col], value)
+    scores = [value + c.log_prior for c, value in zip(candidates, refined, strict=True)]
+    best = int(np.argmax(scores))
     found = _posterior(surface, evidence, problem)
-    return _decide(winner, found, problem)
+    return _decide(candidates[best], refined[best], found, problem)
+
+
+def _evidence(surface: ErrorSurface, relief: ambiguity.Relief) -> Array:
+    return ambiguity.log_evidence(
+        surface.residual_m2, surface.noise_m2, surface.overlap_cells, relief
+    )
+
+
+def _evidence_at(candidate: _Candidate, relief: ambiguity.Relief) -> float:
+    return float(
+        ambiguity.log_evidence(
+            np.array(candidate.residual_m2),
+            np.array(candidate.noise_m2),
+            np.array(candidate.overlap_cells),
+            relief,
+        )
+    )
 
 
 def _window(whole: ErrorSurface, problem: _Problem) -> ErrorSurface | None:
@@ -245,33 +164,35 @@ def _window(whole: ErrorSurface, problem: _Problem) -> ErrorSurface | None:
     east = np.flatnonzero(np.abs(whole.east_m - problem.prior_m[1]) <= half[1])
     if north.size < 2 or east.size < 2:
         return None
-    box = (slice(north[0], north[-1] + 1), slice(east[0], east[-1] + 1))
-    return ErrorSurface(
-        north_m=whole.north_m[box[0]],
-        east_m=whole.east_m[box[1]],
-        overlap_cells=whole.overlap_cells[box],
-        residual_m2=whole.residual_m2[box],
-        depth_offset_m=whole.depth_offset_m[box],
-    )
+    return whole.window(slice(north[0], north[-1] + 1), slice(east[0], east[-1] + 1))
 
 
 def _relief(
     whole: ErrorSurface, surface: ErrorSurface, problem: _Problem
 ) -> ambiguity.Relief | None:
-    """Return background, noise and the number of independent pieces of relief per cell."""
+    """Return background, noise and the information of the relief."""
     row, col = np.unravel_index(int(np.argmin(surface.residual_m2)), surface.residual_m2.shape)
     best_m = np.array([surface.north_m[row], surface.east_m[col]])
     away_m = 3.0 * problem.settings.basin_m
-    background_m2 = ambiguity.background(whole, best_m, away_m)
-    if background_m2 is None:
+    background = ambiguity.background(whole, best_m, away_m)
+    if background is None:
         return None
-    cell_m = problem.query.grid.cell_m
-    relief_m2 = max(background_m2 - problem.noise_m2, 0.0) / 2.0
-    length2_m2 = max(relief_m2 / max(problem.slope2, 1e-12), cell_m**2)
     return ambiguity.Relief(
-        background_m2=background_m2,
-        noise_m2=problem.noise_m2,
-        pieces_per_cell=min(cell_m**2 / (np.pi * length2_m2), 0.25),
+        background=background, information_per_cell=_information(problem, noise_scale=1.0)
+    )
+
+
+def _information(problem: _Problem, noise_scale: float) -> float:
+    """Return the information per cell of the layer that has less of it."""
+    return min(
+        information_per_cell(
+            layer,
+            problem.noise_m2 * noise_scale,
+            problem.shared_m2 * noise_scale,
+            problem.settings.correlation_m,
+            problem.settings.position_sigma_m,
+        )
+        for layer in (problem.reference, problem.query)
     )
 
 
@@ -284,30 +205,32 @@ def _posterior(surface: ErrorSurface, evidence: Array, problem: _Problem) -> amb
 def _refine_best(
     surface: ErrorSurface,
     found: ambiguity.Posterior,
-    relief: ambiguity.Relief,
     problem: _Problem,
     times_s: tuple[float | None, float | None],
 ) -> list[_Candidate]:
     """Return the refined minima among the best lattice shifts."""
-    settings = problem.settings
-    slopes_rq = (
-        slopes(problem.reference, settings.slope_smoothing_cells),
-        slopes(problem.query, settings.slope_smoothing_cells),
+    fields = (
+        fields_of(problem.reference, problem.settings.slope_smoothing_cells),
+        fields_of(problem.query, problem.settings.slope_smoothing_cells),
     )
     inverse = np.linalg.inv(problem.covariance_m2)
     candidates = []
-    for start_m in _starts(surface, found, settings, problem.query.grid.cell_m):
-        refined = refine(
-            problem.reference, problem.query, slopes_rq, start_m, times_s, problem.noise
-        )
-        if refined is None:
+    for start_m in _starts(surface, found, problem.settings, problem.query.grid.cell_m):
+        field = refine(problem.reference, problem.query, fields, start_m, times_s, problem.noise)
+        if field is None:
             continue
-        error, count, _ = _error(problem, refined.shift_m, absolute=False)
-        evidence = float(ambiguity.log_evidence(np.array(error), np.array(count), relief))
-        away = refined.shift_m - problem.prior_m
-        score = evidence - 0.5 * float(away @ inverse @ away)
+        error, count, _ = _error(problem, field.shift_m, absolute=False)
+        if not np.isfinite(error):
+            continue
+        away = field.shift_m - problem.prior_m
         candidates.append(
-            _Candidate(refined=refined, residual_m2=error, evidence=evidence, score=score)
+            _Candidate(
+                field=field,
+                residual_m2=error,
+                overlap_cells=count,
+                noise_m2=float(surface.noise_m2[_nearest(surface, field.shift_m)]),
+                log_prior=-0.5 * float(away @ inverse @ away),
+            )
         )
     return candidates
 
@@ -322,7 +245,7 @@ def _starts(
     order = order[np.argsort(flat[order])[::-1]]
     starts: list[Array] = []
     for index in order:
-        if flat[index] <= 0.0:
+        if flat[index] <= _NEGLIGIBLE * flat[order[0]]:
             break
         row, col = divmod(int(index), found.mass.shape[1])
         shift = np.array([surface.north_m[row], surface.east_m[col]])
@@ -333,14 +256,16 @@ def _starts(
     return starts
 
 
-def _decide(winner: _Candidate, found: ambiguity.Posterior, problem: _Problem) -> MatchOutcome:
+def _decide(
+    winner: _Candidate, evidence: float, found: ambiguity.Posterior, problem: _Problem
+) -> MatchOutcome:
     """Return the winner as a closure in the plane or along one axis, or the gate it failed."""
-    settings, refined = problem.settings, winner.refined
+    settings, refined = problem.settings, measure(winner.field, problem.noise)
     residual, _, _ = _error(problem, refined.shift_m, absolute=settings.residual == "absolute")
     limit = settings.residual_noise_ratio * refined.variance_m2
     if settings.residual == "absolute":
         limit = np.sqrt(limit)
-    if winner.evidence < settings.evidence_limit:
+    if evidence < settings.evidence_limit:
         return _none(NoMatch.FEATURELESS)
     if residual > max(settings.residual_limit, limit):
         return _none(NoMatch.RESIDUAL)
@@ -349,7 +274,7 @@ def _decide(winner: _Candidate, found: ambiguity.Posterior, problem: _Problem) -
     sigmas = np.sqrt(values)
     verdict = ambiguity.judge(found, refined.shift_m, settings.basin_m)
     if verdict.false_mass <= settings.false_mass_limit and sigmas[1] <= settings.sigma_limit_m:
-        return _closure(winner, residual, covariance, None, verdict.false_mass)
+        return _closure(refined, residual, evidence, covariance, None, verdict.false_mass)
     if verdict.false_mass <= settings.false_mass_limit:
         axis, false_mass = vectors[:, 0], verdict.false_mass
     elif verdict.false_mass_off_line <= settings.false_mass_limit:
@@ -363,17 +288,17 @@ def _decide(winner: _Candidate, found: ambiguity.Posterior, problem: _Problem) -
     across = np.array([-axis[1], axis[0]])
     wide = along * np.outer(axis, axis) + settings.search_cap_m**2 * np.outer(across, across)
     axis_deg = float(np.degrees(np.arctan2(axis[1], axis[0])) % 180.0)
-    return _closure(winner, residual, wide, axis_deg, false_mass)
+    return _closure(refined, residual, evidence, wide, axis_deg, false_mass)
 
 
 def _closure(
-    winner: _Candidate,
+    refined: Refined,
     residual: float,
+    log_evidence: float,
     covariance_m2: Array,
     axis_deg: float | None,
     false_mass: float,
 ) -> MatchOutcome:
-    refined = winner.refined
     found = Match(
         shift_m=refined.shift_m,
         covariance_m2=covariance_m2,
@@ -382,7 +307,7 @@ def _closure(
         depth_offset_m=refined.depth_offset_m,
         axis_deg=axis_deg,
         false_mass=false_mass,
-        log_evidence=winner.evidence,
+        log_evidence=log_evidence,
         misfit=refined.misfit,
         variance_m2=refined.variance_m2,
         reference_time_s=refined.reference_time_s,
@@ -413,23 +338,8 @@ def _none(reason: NoMatch) -> MatchOutcome:
     return MatchOutcome(match=None, reason=reason)
 
 
-def _mean_variance(layer: Layer) -> float:
-    return float(np.nanmean(layer.grid.variance_m2))
-
-
-def _mean_slope2(layer: Layer) -> float:
-    """Return the mean squared slope per axis, free of the cells' noise.
-
-    A product of differences that share no cell: noise is independent, relief is not.
-    """
-    depth, step_m = layer.grid.depth_m, layer.grid.cell_m
-    products = []
-    for values in (depth, depth.T):
-        difference = np.diff(values, axis=0)
-        product = difference[:-2] * difference[2:]
-        products.append(product[np.isfinite(product)])
-    both = np.concatenate(products)
-    return max(float(both.mean()) / step_m**2, 0.0) if both.size else 0.0
+def _mean_noise(layer: Layer) -> float:
+    return float(layer.noise_m2.sum() / layer.known.sum())
 
 
 def _check(reference: GriddedSubmap, query: GriddedSubmap, covariance_m2: Array) -> None:

@@ -11,7 +11,6 @@ import numpy as np
 from scipy import fft
 
 from firmware.geometry import Array
-from firmware.leader.warping import bilinear
 from firmware.submaps import GriddedSubmap
 
 
@@ -20,30 +19,51 @@ class Layer:
     """A grid cropped to its known cells, ready for correlation.
 
     depth_m is zero and weight zero where nothing is known; weight is 1, or exp(-Omega) of Eq. (10)
-    when the grid is reconstructed. All fields are (R, C).
+    when the grid is reconstructed; noise_m2 is what the grid contributes to the variance of a
+    difference, zero where unknown. All fields are (R, C).
     """
 
     grid: GriddedSubmap
     known: Array
     weight: Array
+    noise_m2: Array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ErrorSurface:
     """Residual error over lattice shifts (K,), (L,): what to add to the query's coordinates.
 
-    residual_m2 is E with the depth offset taken out, inf where overlap_cells <= N_T; (K, L).
+    residual_m2 is E with the depth offset taken out, inf where overlap_cells <= N_T; noise_m2 is
+    what the layers' noise alone would make of it; (K, L).
     """
 
     north_m: Array
     east_m: Array
     overlap_cells: Array
     residual_m2: Array
+    noise_m2: Array
     depth_offset_m: Array
 
+    def window(self, north: slice, east: slice) -> "ErrorSurface":
+        """Return a rectangle of it."""
+        return ErrorSurface(
+            north_m=self.north_m[north],
+            east_m=self.east_m[east],
+            overlap_cells=self.overlap_cells[north, east],
+            residual_m2=self.residual_m2[north, east],
+            noise_m2=self.noise_m2[north, east],
+            depth_offset_m=self.depth_offset_m[north, east],
+        )
 
-def prepare(grid: GriddedSubmap, *, reconstructed: bool) -> Layer | None:
-    """Return the grid cropped to its known cells, or None if no cell is known."""
+
+def prepare(
+    grid: GriddedSubmap, *, reconstructed: bool, cell_sigma_m: float, position_sigma_m: float
+) -> Layer | None:
+    """Return the grid cropped to its known cells, or None if no cell is known.
+
+    The noise of a cell is its variance, half of the squared cell_sigma_m and half of what
+    position_sigma_m makes on the mean slope: the other layer carries the other halves.
+    """
     known = np.isfinite(grid.depth_m) & np.isfinite(grid.variance_m2)
     rows, cols = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
     if not rows.size:
@@ -59,7 +79,23 @@ def prepare(grid: GriddedSubmap, *, reconstructed: bool) -> Layer | None:
     )
     mask = known[box].astype(np.float64)
     weight = mask * np.exp(-np.nan_to_num(cropped.variance_m2)) if reconstructed else mask
-    return Layer(grid=cropped, known=mask, weight=weight)
+    half_m2 = 0.5 * (cell_sigma_m**2 + position_sigma_m**2 * 2.0 * mean_slope2(cropped))
+    noise = mask * (np.nan_to_num(cropped.variance_m2) + half_m2)
+    return Layer(grid=cropped, known=mask, weight=weight, noise_m2=noise)
+
+
+def mean_slope2(grid: GriddedSubmap) -> float:
+    """Return the mean squared slope per axis, free of the cells' noise.
+
+    A product of differences that share no cell: noise is independent, relief is not.
+    """
+    products = []
+    for values in (grid.depth_m, grid.depth_m.T):
+        difference = np.diff(values, axis=0)
+        product = difference[:-2] * difference[2:]
+        products.append(product[np.isfinite(product)])
+    both = np.concatenate(products)
+    return max(float(both.mean()) / grid.cell_m**2, 0.0) if both.size else 0.0
 
 
 def error_surface(
@@ -85,10 +121,11 @@ def error_surface(
             f_r[1] * f_q[1],
             f_r[2] * f_q[1] - f_r[1] * f_q[2],
             f_r[3] * f_q[1] - 2.0 * f_r[2] * f_q[2] + f_r[1] * f_q[3],
+            f_r[4] * f_q[0] + f_r[0] * f_q[4],
         ]
     )
     sums = np.roll(fft.irfft2(spectra, s=size), (query_rows - 1, query_cols - 1), axis=(1, 2))
-    count, weight, first, second = sums[:, : full[0], : full[1]]
+    count, weight, first, second, noise = sums[:, : full[0], : full[1]]
     count = np.round(count)
     weight = np.maximum(weight, 0.0)
     offset = first / (np.maximum(weight, 1e-9) + offset_ridge_cells)
@@ -104,14 +141,16 @@ def error_surface(
         + cell_m * np.arange(1 - query_cols, cols),
         overlap_cells=count,
         residual_m2=np.where(enough, error / np.maximum(count, 1.0), np.inf),
+        noise_m2=np.maximum(noise / np.maximum(count, 1.0), 1e-9),
         depth_offset_m=offset,
     )
 
 
 def _moments(layer: Layer, datum_m: float) -> Array:
-    """Return mask, weight, weighted depth and weighted squared depth, zero where unknown."""
+    """Return mask, weight, weighted depth, its square and the noise, zero where unknown."""
     depth = np.where(layer.known > 0, layer.grid.depth_m - datum_m, 0.0)
-    return np.stack([layer.known, layer.weight, layer.weight * depth, layer.weight * depth**2])
+    weighted = layer.weight * depth
+    return np.stack([layer.known, layer.weight, weighted, weighted * depth, layer.noise_m2])
 
 
 def error_at(
@@ -128,9 +167,12 @@ def error_at(
     The reference is interpolated at the query's cells; with `absolute` the norm is |d| in metres
     instead of its square.
     """
-    row, col = landing(reference.grid, query.grid, shift_m)
-    difference = bilinear(reference.grid.depth_m, row, col) - query.grid.depth_m
-    weight = query.weight * np.nan_to_num(bilinear(reference.weight, row, col))
+    at = land(reference.grid, query.grid, shift_m)
+    if at is None:
+        return np.inf, 0, 0.0
+    depth, mass = sample(np.stack([reference.grid.depth_m, reference.weight]), at)
+    difference = depth - query.grid.depth_m[at.query]
+    weight = query.weight[at.query] * mass
     both = np.isfinite(difference) & (weight > 0)
     count = int(both.sum())
     if count <= minimum_cells:
@@ -141,17 +183,65 @@ def error_at(
     return float(w @ norm) / count, count, offset
 
 
-def landing(reference: GriddedSubmap, query: GriddedSubmap, shift_m: Array) -> tuple[Array, Array]:
-    """Return the reference's fractional row and column (R, C) under each shifted query cell."""
-    rows, cols = query.depth_m.shape
-    row = (query.north0_m + shift_m[0] - reference.north0_m) / query.cell_m + np.arange(rows)
-    col = (query.east0_m + shift_m[1] - reference.east0_m) / query.cell_m + np.arange(cols)
-    row, col = _snap(row), _snap(col)
-    grid_row, grid_col = np.meshgrid(row, col, indexing="ij")
-    return grid_row, grid_col
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Landing:
+    """Where a shifted lattice lies on another: one fraction of a cell for all of its cells.
+
+    query is the rectangle of the query that meets the reference; row and col are the reference's
+    indices under its first cell, north and east the fractions beyond them.
+    """
+
+    query: tuple[slice, slice]
+    row: int
+    col: int
+    north: float
+    east: float
 
 
-def _snap(index: Array) -> Array:
-    """Return indices with rounding noise removed, so that lattice shifts stay on the lattice."""
-    near = np.round(index)
-    return np.where(np.abs(index - near) < 1e-7, near, index)
+def land(reference: GriddedSubmap, query: GriddedSubmap, shift_m: Array) -> Landing | None:
+    """Return where the shifted query lies on the reference, None if they do not meet."""
+    row = (query.north0_m + shift_m[0] - reference.north0_m) / query.cell_m
+    col = (query.east0_m + shift_m[1] - reference.east0_m) / query.cell_m
+    if not np.isfinite(row) or not np.isfinite(col):
+        return None
+    (i, north), (j, east) = _split(float(row)), _split(float(col))
+    rows, cols = reference.depth_m.shape
+    query_rows, query_cols = query.depth_m.shape
+    first_row, first_col = max(0, -i), max(0, -j)
+    last_row = min(query_rows, rows - i - (north > 0.0))
+    last_col = min(query_cols, cols - j - (east > 0.0))
+    if last_row <= first_row or last_col <= first_col:
+        return None
+    return Landing(
+        query=(slice(first_row, last_row), slice(first_col, last_col)),
+        row=i + first_row,
+        col=j + first_col,
+        north=north,
+        east=east,
+    )
+
+
+def sample(fields: Array, at: Landing) -> Array:
+    """Return the fields (..., R, C) of the reference under the landed rectangle, bilinear.
+
+    NaN next to unknown cells, unless their weight is zero: a shift by whole cells returns the
+    cells themselves.
+    """
+    rows = at.query[0].stop - at.query[0].start
+    cols = at.query[1].stop - at.query[1].start
+    total = np.zeros((*fields.shape[:-2], rows, cols))
+    for down, weight_n in ((0, 1.0 - at.north), (1, at.north)):
+        for right, weight_e in ((0, 1.0 - at.east), (1, at.east)):
+            if weight_n * weight_e > 0.0:
+                i, j = at.row + down, at.col + right
+                total += weight_n * weight_e * fields[..., i : i + rows, j : j + cols]
+    return total
+
+
+def _split(index: float) -> tuple[int, float]:
+    """Return whole and fraction, rounding noise removed so that lattice shifts stay whole."""
+    near = round(index)
+    if abs(index - near) < 1e-7:
+        return near, 0.0
+    whole = int(np.floor(index))
+    return whole, index - whole

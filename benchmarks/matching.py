@@ -1,0 +1,299 @@
+"""Matching of sub-map pairs as a mission makes them: found, valid, honest, how fast.
+
+    python benchmarks/matching.py --pairs 200 --seed 1 [--relief rough,ridge] [--prior 2,10,30,60]
+
+Pairs lie as in the survey: parallel strips 100 m apart (39 m of overlap) and crossings, soundings
+with 0.15 m and 0.3 % of the slant range of noise, dead reckoning with Eq. 12's random walk and
+a rate that is left after the removal of drift. Real terrains join when FATHOMLINK_DATA is set.
+"""
+
+import argparse
+import os
+import time
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, interpolate, ndimage
+
+from firmware.geometry import Array
+from firmware.leader.matching import MatchingSettings, MatchOutcome, match
+from firmware.submaps import GriddedSubmap
+
+CELL_M = 2.0
+SPEED_MPS = 2.06
+DURATION_S = 40.0
+TERRAINS = {
+    "massbay": "massbay_west_5m.tif",
+    "medes": "medes_islands_10m.tif",
+    "portsmouth": "portsmouth_ripples_50cm.bag",
+    "shelf": "flat_shelf_2m.bag",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Seabed:
+    """Depth (R, C) on a square lattice; NaN where there is no data."""
+
+    depth_m: Array
+    cell_m: float
+
+    def at(self, north_m: Array, east_m: Array) -> Array:
+        """Return the bilinear depth."""
+        return ndimage.map_coordinates(
+            self.depth_m, [north_m / self.cell_m, east_m / self.cell_m], order=1, cval=np.nan
+        )
+
+    @property
+    def size_m(self) -> tuple[float, float]:
+        """Return the extent to north and east."""
+        return self.depth_m.shape[0] * self.cell_m, self.depth_m.shape[1] * self.cell_m
+
+
+def synthetic(kind: str, rng: np.random.Generator) -> Seabed:
+    """Return 1.2 x 1.2 km of relief of a named kind."""
+    n, cell = 600, 2.0
+    wave = np.hypot(*np.meshgrid(fft.fftfreq(n, cell), fft.fftfreq(n, cell), indexing="ij"))
+    wave[0, 0] = np.inf
+    field = fft.ifft2(fft.fft2(rng.standard_normal((n, n))) * wave**-1.75).real
+    field *= 1.0 / np.sqrt(np.mean((field - ndimage.uniform_filter(field, 100)) ** 2))
+    north, east = np.meshgrid(np.arange(n) * cell, np.arange(n) * cell, indexing="ij")
+    if kind == "rough":
+        depth = 0.8 * field
+    elif kind == "gentle":
+        depth = 0.25 * field
+    elif kind == "flat":
+        depth = 0.01 * field
+    elif kind == "ridge":
+        depth = 0.02 * field + np.interp(east, np.arange(n) * cell, 1.0 * field[0])
+    else:
+        depth = 0.1 * field + 0.4 * np.sin(2.0 * np.pi * (north + 0.2 * east) / 12.0)
+    return Seabed(depth_m=40.0 + depth, cell_m=cell)
+
+
+def terrain(name: str) -> Seabed:
+    """Return a real terrain, moved so that the mean depth is that of a 40 m altitude."""
+    import rasterio  # noqa: PLC0415  only where the data is there
+
+    with rasterio.open(Path(os.environ["FATHOMLINK_DATA"]) / "terrain" / TERRAINS[name]) as data:
+        elevation = data.read(1, masked=True).filled(np.nan).astype(np.float64)[::-1]
+        cell = float(data.res[0])
+    depth = -elevation
+    return Seabed(depth_m=depth - np.nanmean(depth) + 40.0, cell_m=cell)
+
+
+def survey(
+    seabed: Seabed,
+    centre_m: Array,
+    heading_rad: float,
+    rng: np.random.Generator,
+    drift_sigma_mps: float,
+) -> GriddedSubmap:
+    """Return the gridded sub-map of a straight line in dead reckoning that is right at mid-time."""
+    times = np.arange(0.0, DURATION_S, 0.25)
+    forward = np.array([np.cos(heading_rad), np.sin(heading_rad)])
+    starboard = np.array([-np.sin(heading_rad), np.cos(heading_rad)])
+    truth = centre_m + forward * ((times - DURATION_S / 2.0) * SPEED_MPS)[:, None]
+    local = _depth_near(seabed, centre_m)
+    angles = np.radians(np.linspace(-60.0, 60.0, 192))
+    yaw = np.radians(0.1) * rng.standard_normal(times.size)
+    altitude = np.full((times.size, 192), 40.0)
+    for _ in range(3):
+        across = altitude * np.tan(angles)
+        north = truth[:, :1] + starboard[0] * across
+        east = truth[:, 1:] + starboard[1] * across
+        altitude = np.nan_to_num(seabed.at(north, east) - (local - 40.0), nan=40.0)
+        altitude = np.clip(altitude, 15.0, 150.0)
+    slant = altitude / np.cos(angles)
+    sigma = np.hypot(0.15, 0.003 * slant)
+    depth = seabed.at(north, east) + sigma * rng.standard_normal(slant.shape)
+    walk = np.cumsum(rng.normal(0.0, 0.2 * 0.5, (times.size, 2)), axis=0)
+    walk += np.outer(times, rng.normal(0.0, drift_sigma_mps, 2))
+    walk -= walk[times.size // 2]
+    across = altitude * np.tan(angles)
+    believed = truth + walk
+    turned = np.stack([starboard[0] - forward[0] * yaw, starboard[1] - forward[1] * yaw])
+    north = believed[:, :1] + turned[0][:, None] * across
+    east = believed[:, 1:] + turned[1][:, None] * across
+    return _grid(north, east, depth, np.broadcast_to(times[:, None], depth.shape), sigma)
+
+
+def _depth_near(seabed: Seabed, centre_m: Array) -> float:
+    offsets = np.linspace(-60.0, 60.0, 13)
+    north, east = np.meshgrid(centre_m[0] + offsets, centre_m[1] + offsets, indexing="ij")
+    return float(np.nanmean(seabed.at(north, east)))
+
+
+def _grid(north: Array, east: Array, depth: Array, times: Array, sigma: Array) -> GriddedSubmap:
+    known = np.isfinite(depth)
+    row = np.round(north[known] / CELL_M).astype(int)
+    col = np.round(east[known] / CELL_M).astype(int)
+    row0, col0 = row.min(), col.min()
+    shape = (row.max() - row0 + 1, col.max() - col0 + 1)
+    index = (row - row0) * shape[1] + col - col0
+
+    def total(values: Array | None) -> Array:
+        return np.bincount(index, values, shape[0] * shape[1]).reshape(shape).astype(np.float64)
+
+    count = total(None)
+    safe = np.where(count > 0, count, np.nan)
+    mean_variance = total(sigma[known] ** 2) / safe
+    return GriddedSubmap(
+        north0_m=float(row0 * CELL_M),
+        east0_m=float(col0 * CELL_M),
+        cell_m=CELL_M,
+        depth_m=total(depth[known]) / safe,
+        variance_m2=mean_variance / safe,
+        time_s=total(times[known]) / safe,
+    )
+
+
+def thinned(grid: GriddedSubmap, rng: np.random.Generator) -> GriddedSubmap:
+    """Return the grid rebuilt from 150 smoothed points, as after the acoustic link."""
+    known = np.isfinite(grid.depth_m)
+    mask = known.astype(float)
+    smooth = ndimage.gaussian_filter(np.where(known, grid.depth_m, 0.0), 1.0)
+    smooth = np.where(known, smooth / np.maximum(ndimage.gaussian_filter(mask, 1.0), 0.05), np.nan)
+    cells = np.argwhere(known)
+    chosen = cells[_spread(cells, 150, rng)]
+    surface = interpolate.RBFInterpolator(
+        chosen, smooth[tuple(chosen.T)], kernel="thin_plate_spline", smoothing=0.1, neighbors=30
+    )
+    depth = np.full(grid.depth_m.shape, np.nan)
+    depth[known] = surface(cells.astype(float))
+    error_m2 = np.nanvar(depth - grid.depth_m) - float(np.nanmean(grid.variance_m2))
+    variance = np.where(known, max(error_m2, 0.03**2), np.nan)
+    return GriddedSubmap(
+        north0_m=grid.north0_m,
+        east0_m=grid.east0_m,
+        cell_m=grid.cell_m,
+        depth_m=depth,
+        variance_m2=variance,
+        time_s=grid.time_s,
+    )
+
+
+def _spread(cells: NDArray[np.intp], count: int, rng: np.random.Generator) -> list[int]:
+    chosen = [int(rng.integers(len(cells)))]
+    nearest = np.full(len(cells), np.inf)
+    while len(chosen) < count:
+        nearest = np.minimum(nearest, np.sum((cells - cells[chosen[-1]]) ** 2, axis=1))
+        chosen.append(int(np.argmax(nearest)))
+    return chosen
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pair:
+    """Two sub-maps and the shift that dead reckoning is off by."""
+
+    reference: GriddedSubmap
+    query: GriddedSubmap
+    reconstructed: GriddedSubmap
+
+
+def make_pair(seabed: Seabed, rng: np.random.Generator, drift_sigma_mps: float) -> Pair:
+    """Return two overlapping sub-maps in exact coordinates; parallel or crossing by a coin."""
+    for _ in range(1000):
+        centre = rng.uniform(160.0, np.array(seabed.size_m) - 160.0)
+        heading = rng.choice([0.0, 0.5, 1.0, 1.5]) * np.pi
+        across = np.array([-np.sin(heading), np.cos(heading)])
+        along = np.array([np.cos(heading), np.sin(heading)])
+        if rng.random() < 0.5:
+            other, other_heading = centre + 100.0 * across + rng.uniform(-30, 30) * along, heading
+            other_heading += np.pi
+        else:
+            other = centre + rng.uniform(-40, 40) * across + rng.uniform(-40, 40) * along
+            other_heading = heading + np.pi / 2.0
+        if _covered(seabed, centre) and _covered(seabed, other):
+            break
+    reference = survey(seabed, centre, heading, rng, drift_sigma_mps)
+    query = survey(seabed, other, other_heading, rng, drift_sigma_mps)
+    return Pair(reference=reference, query=query, reconstructed=thinned(query, rng))
+
+
+def _covered(seabed: Seabed, centre: Array) -> bool:
+    offsets = np.linspace(-60.0, 60.0, 9)
+    north, east = np.meshgrid(centre[0] + offsets, centre[1] + offsets, indexing="ij")
+    depth = seabed.at(north, east)
+    return bool(np.isfinite(depth).mean() > 0.9 and np.nanmin(depth) > np.nanmean(depth) - 25.0)
+
+
+def report(label: str, results: list[tuple[MatchOutcome, Array, float]]) -> str:
+    """Return one line: found, valid, NEES, one-axis closures, time, reasons."""
+    full = [(o.match, e) for o, e, _ in results if o.match and o.match.axis_deg is None]
+    single = [(o.match, e) for o, e, _ in results if o.match and o.match.axis_deg is not None]
+    errors = [float(np.hypot(*e)) for _, e in full]
+    valid = [(m, e) for m, e in full if np.hypot(*e) < 5.0]
+    nees = [float(e @ np.linalg.solve(m.covariance_m2, e)) for m, e in valid]
+    axis_errors = []
+    for m, e in single:
+        axis_rad = np.radians(m.axis_deg or 0.0)
+        axis = np.array([np.cos(axis_rad), np.sin(axis_rad)])
+        axis_errors.append(
+            (abs(axis @ e), float((axis @ e) ** 2 / (axis @ m.covariance_m2 @ axis)))
+        )
+    good_axis = [n for a, n in axis_errors if a < 5.0]
+    reasons = Counter(o.reason.name for o, _, _ in results if o.reason)
+    line = f"{label:34s} found {len(full):3d} valid {len(valid):3d}"
+    line += f" rms {np.sqrt(np.mean([e**2 for e in errors if e < 5])) if valid else np.nan:5.2f}"
+    line += f" NEES {np.mean(nees) if nees else np.nan:5.2f}"
+    line += f" med {np.median(nees) if nees else np.nan:4.2f}"
+    line += f" | axis {len(single):3d} valid {len(good_axis):3d}"
+    line += f" NEES1 {np.mean(good_axis) if good_axis else np.nan:5.2f}"
+    line += f" | {1e3 * np.median([t for _, _, t in results]):5.1f} ms | "
+    return line + " ".join(f"{k}:{v}" for k, v in sorted(reasons.items()))
+
+
+def run(
+    label: str,
+    pairs: int,
+    seed: int,
+    priors_m: list[float],
+    settings: MatchingSettings,
+) -> None:
+    """Print a line per prior, for own sub-maps and for reconstructed ones."""
+    rng = np.random.default_rng(seed)
+    beds = [terrain(label)] if label in TERRAINS else [synthetic(label, rng) for _ in range(5)]
+    made = [make_pair(beds[i % len(beds)], rng, 0.02) for i in range(pairs)]
+    for prior_m in priors_m:
+        for kind in ("own", "rebuilt"):
+            results = []
+            for pair in made:
+                offset = rng.normal(0.0, prior_m, 2)
+                query = pair.query if kind == "own" else pair.reconstructed
+                started = time.perf_counter()
+                outcome = match(
+                    pair.reference,
+                    query,
+                    offset,
+                    np.eye(2) * prior_m**2,
+                    settings,
+                    query_reconstructed=kind == "rebuilt",
+                    times_s=(DURATION_S / 2.0, DURATION_S / 2.0),
+                )
+                took = time.perf_counter() - started
+                error = outcome.match.shift_m if outcome.match else np.zeros(2)
+                results.append((outcome, error, took))
+            print(report(f"{label} {kind} prior {prior_m:g} m", results), flush=True)
+
+
+def main() -> None:
+    """Run the kinds of relief asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--pairs", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--relief", default="rough,gentle,ridge,ripples,flat," + ",".join(TERRAINS))
+    parser.add_argument("--prior", default="2,10,30,60")
+    arguments = parser.parse_args()
+    priors_m = [float(p) for p in arguments.prior.split(",")]
+    for kind in arguments.relief.split(","):
+        if kind in TERRAINS and "FATHOMLINK_DATA" not in os.environ:
+            print(f"{kind}: skipped, FATHOMLINK_DATA is not set")
+            continue
+        run(kind, arguments.pairs, arguments.seed, priors_m, MatchingSettings())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,120 @@
+"""An honest covariance of a refined shift, from the residuals it leaves."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft
+
+from firmware.geometry import Array
+from firmware.leader.alignment import Aligned, NoiseModel, design_of
+from firmware.leader.refinement import solve
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Refined:
+    """The optimum near one candidate.
+
+    covariance_m2 (2, 2) is of the shift between the two reference times, a kilometre along a
+    direction that the overlap says nothing about. variance_m2 is the predicted mean variance of a
+    cell's difference; misfit the mean of squared normalised residuals (1 when the model holds).
+    """
+
+    shift_m: Array
+    covariance_m2: Array
+    depth_offset_m: float
+    variance_m2: float
+    misfit: float
+    overlap_cells: int
+    reference_time_s: float
+    query_time_s: float
+
+
+def measure(field: Aligned, noise: NoiseModel) -> Refined:
+    """Return the fit at its optimum with the sandwich covariance."""
+    columns, prior = design_of(field, noise)
+    unknowns = solve(field, columns, prior)
+    residual = field.both * (field.difference_m - np.tensordot(unknowns, columns, axes=1))
+    cells = field.both.sum()
+    misfit = float(np.sum(field.weight * residual**2) / cells)
+    score = _score_covariance(field, columns, residual, max(misfit, 1.0), noise)
+    covariance = _sandwich(field, columns, prior, score)
+    for span in field.spans:
+        away_s = abs(span.mean_s - span.origin_s)
+        covariance = covariance + np.eye(2) * noise.walk_m2_per_s * (away_s + span.length_s / 12.0)
+    return Refined(
+        shift_m=field.shift_m,
+        covariance_m2=covariance,
+        depth_offset_m=float(unknowns[2]) if noise.offset_sigma_m > 0.0 else 0.0,
+        variance_m2=float(np.sum(field.variance_m2 * field.both) / cells),
+        misfit=misfit,
+        overlap_cells=int(cells),
+        reference_time_s=field.spans[0].origin_s,
+        query_time_s=field.spans[1].origin_s,
+    )
+
+
+def _sandwich(field: Aligned, columns: Array, prior: Array, score: Array) -> Array:
+    """Return H^-1 (B + P) H^-1 of the shift, (2, 2).
+
+    H is the curvature; its shift block multiplies the slopes of one grid with those of the other,
+    whose noises are independent, so that noise alone makes no information. B is the covariance of
+    the score under residuals correlated as they are seen to be, and at least as the model says.
+    """
+    p = columns.shape[0]
+    design = columns.reshape(p, -1)
+    weight = field.weight.ravel()
+    curvature = (design * weight) @ design.T
+    cross = (field.slope_r.reshape(2, -1) * weight) @ field.slope_q.reshape(2, -1).T
+    raw = curvature[:2, :2].copy()
+    curvature[:2, :2] = 0.5 * (cross + cross.T)
+    values, vectors = np.linalg.eigh(curvature[:2, :2])
+    usable = values > 0.25 * np.einsum("ia,ij,ja->a", vectors, raw, vectors)
+    rotated = np.eye(p)
+    rotated[:2, :2] = vectors.T
+    keep = np.concatenate([usable, np.ones(p - 2, dtype=bool)])
+    h = (rotated @ (curvature + np.diag(prior)) @ rotated.T)[np.ix_(keep, keep)]
+    b = (rotated @ (score + np.diag(prior)) @ rotated.T)[np.ix_(keep, keep)]
+    inverse = np.linalg.inv(h)
+    covariance = inverse @ b @ inverse.T
+    known = int(usable.sum())
+    local = np.full(2, 1e6)  # a kilometre: nothing is known in that direction
+    spread = np.diag(local)
+    spread[np.ix_(usable, usable)] = covariance[:known, :known]
+    result = vectors @ spread @ vectors.T
+    return np.asarray(0.5 * (result + result.T))
+
+
+def _score_covariance(
+    field: Aligned,
+    columns: Array,
+    residual: Array,
+    misfit: float,
+    noise: NoiseModel,
+) -> Array:
+    """Return sum_ij u_i C(i - j) u_j' (p, p), where u = weight * column and C is seen in r."""
+    shape = field.both.shape
+    size = tuple(fft.next_fast_len(2 * n, real=True) for n in shape)
+    root = np.sqrt(field.weight)
+    stack = np.concatenate([[field.both, root * residual], columns * root], axis=0)
+    spectrum = fft.rfft2(stack, s=size)
+    pairs = fft.irfft2(np.abs(spectrum[0]) ** 2, s=size)
+    seen = fft.irfft2(np.abs(spectrum[1]) ** 2, s=size) / np.maximum(pairs, 1.0)
+    lag = [fft.fftfreq(n, 1.0 / n) * field.cell_m for n in size]
+    distance = np.hypot(lag[0][:, None], lag[1][None, :])
+    taper = np.maximum(1.0 - distance / (4.0 * noise.correlation_m), 0.0)
+    model = np.exp(-0.5 * (distance / noise.correlation_m) ** 2) * noise.correlated_share * misfit
+    model[0, 0] = misfit
+    floor = np.maximum(fft.rfft2(np.where(pairs > 0.5, seen, 0.0) * taper).real, 0.0)
+    power = np.maximum(floor, fft.rfft2(model).real)
+    return _quadratic(spectrum[2:], power, size)
+
+
+def _quadratic(spectrum: Array, power: Array, size: tuple[int, ...]) -> Array:
+    """Return Parseval's sum over both halves of the spectrum of u power u', (p, p)."""
+    double = np.full(spectrum.shape[2], 2.0)
+    double[0] = 1.0
+    if size[1] % 2 == 0:
+        double[-1] = 1.0
+    flat = spectrum.reshape(spectrum.shape[0], -1)
+    weight = (power * double).ravel() / (size[0] * size[1])
+    return np.asarray(((flat * weight) @ flat.conj().T).real)

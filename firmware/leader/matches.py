@@ -1,0 +1,131 @@
+"""What matching is told and what it answers: settings, a match, or the reason for none."""
+
+import enum
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from firmware.geometry import Array
+from protocol.settings import Settings, setting
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MatchingSettings(Settings):
+    """How sub-maps are matched and when a match becomes a closure."""
+
+    residual: str = setting(
+        "squared",
+        "",
+        "the 0.02 of the paper lies above the noise only on the squared reading",
+        choices=("squared", "absolute"),
+    )
+    residual_limit: float = setting(0.02, "m^2 or m", "the paper's threshold on E", minimum=0.0)
+    residual_noise_ratio: float = setting(
+        2.5, "", "E may be this many times the predicted noise where that is larger", minimum=0.0
+    )
+    minimum_overlap_m2: float = setting(
+        480.0, "m^2", "the paper's N_T = 120 points of 2 m cells", minimum=0.0
+    )
+    search_sigmas: float = setting(3.0, "", "99 % of the prior's mass", minimum=1.0)
+    search_cap_m: float = setting(200.0, "m", "beyond it sub-maps do not meet", minimum=1.0)
+    candidates: int = setting(200, "", "lattice shifts looked at more closely", minimum=1)
+    basins: int = setting(4, "", "separate minima refined below the cell", minimum=1)
+    depth_offset_sigma_m: float = setting(
+        0.3, "m", "tide and datum between passes; 0 is the paper's absolute depth", minimum=0.0
+    )
+    tilt_sigma: float = setting(
+        0.004, "m/m", "roll bias of 0.2 degree seen from both sides", minimum=0.0
+    )
+    bend_sigma_per_m: float = setting(
+        4e-5, "1/m", "a smile of 0.15 m at the edge of a 60 m swath", minimum=0.0
+    )
+    drift_sigma_mps: float = setting(
+        0.03, "m/s", "drift within a sub-map that is left after its removal", minimum=0.0
+    )
+    walk_m2_per_s: float = setting(
+        0.04, "m^2/s", "Eq. 12: variance 0.04 a second and axis", minimum=0.0
+    )
+    cell_sigma_m: float = setting(
+        0.02, "m", "gridding and sub-cell relief beside the sounding noise", minimum=0.001
+    )
+    position_sigma_m: float = setting(
+        0.5, "m", "heading noise and wandering inside a sub-map, felt on slopes", minimum=0.0
+    )
+    correlation_m: float = setting(
+        8.0, "m", "spacing of 150 pseudo points on a sub-map", minimum=0.1
+    )
+    correlated_share: float = setting(
+        0.5, "", "of a reconstruction's variance that neighbours share", minimum=0.0, maximum=1.0
+    )
+    basin_m: float = setting(5.0, "m", "further off a closure is called invalid", minimum=0.1)
+    false_mass_limit: float = setting(
+        0.05, "", "posterior mass that may lie outside the winner's basin", minimum=0.0, maximum=1.0
+    )
+    null_share: float = setting(
+        0.01, "", "chance that the graph's prior is wrong altogether", minimum=0.0, maximum=1.0
+    )
+    evidence_limit: float = setting(
+        3.0, "", "log evidence of the relief alone, whatever the prior says", minimum=0.0
+    )
+    sigma_limit_m: float = setting(
+        2.5, "m", "a weaker shift could not be told from an invalid one", minimum=0.0
+    )
+    covariance_scale: float = setting(
+        1.0, "", "from simulated pairs, so that NEES is 2", minimum=0.1
+    )
+    slope_smoothing_cells: float = setting(
+        1.0, "cells", "keeps sounding noise out of the slopes", minimum=0.1
+    )
+
+
+class NoMatch(enum.Enum):
+    """Why two sub-maps gave no closure."""
+
+    EMPTY = "a grid has no known cell"
+    NO_OVERLAP = "no shift of the search window has enough overlap"
+    FEATURELESS = "too little relief to tell a match from chance"
+    RESIDUAL = "the least residual error is above the threshold"
+    AMBIGUOUS = "another shift explains the data nearly as well"
+    LOOSE = "the minimum is too wide in both directions"
+    UNSETTLED = "no minimum could be refined below the cell"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Match:
+    """A shift to add to the query's NED coordinates so that it lies on the reference.
+
+    The shift holds between the reference's instant and the query's; by default these are the
+    mean times at which the overlap was measured. covariance_m2 (2, 2) is the measurement's own,
+    without the prior. axis_deg is None, or the direction from north in which a one-axis closure
+    holds; across it the covariance is wide. false_mass is the posterior probability that the true
+    shift lies outside the winner's basin (outside its line, for one axis).
+    """
+
+    shift_m: Array
+    covariance_m2: Array
+    residual: float
+    overlap_cells: int
+    depth_offset_m: float
+    axis_deg: float | None
+    false_mass: float
+    log_evidence: float
+    misfit: float
+    variance_m2: float
+    reference_time_s: float
+    query_time_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MatchOutcome:
+    """A match, or the reason why there is none."""
+
+    match: Match | None
+    reason: NoMatch | None
+
+
+def count_reasons(outcomes: Iterable[MatchOutcome]) -> dict[NoMatch, int]:
+    """Return how often each reason occurred."""
+    counts = dict.fromkeys(NoMatch, 0)
+    for outcome in outcomes:
+        if outcome.reason is not None:
+            counts[outcome.reason] += 1
+    return counts

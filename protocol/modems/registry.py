@@ -9,6 +9,8 @@ from protocol.modems.base import Modem, ModemContext, ModemUrl
 
 DIALECTS: dict[str, str] = {
     "loopback": "protocol.modems.loopback:open_loopback",
+    "micromodem": "protocol.modems.micromodem:open_micromodem",
+    "nanomodem": "protocol.modems.nanomodem:open_nanomodem",
     "serial": "protocol.modems.serial_line:open_serial",
 }
 """Scheme to module:function; imported when asked for, so one broken driver harms no other."""

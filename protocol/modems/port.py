@@ -1,0 +1,120 @@
+"""A serial port that never blocks and may vanish and come back; the bytes are not its business."""
+
+import os
+from collections.abc import Callable
+
+import serial
+
+from protocol.errors import ModemUnavailable
+from protocol.modems.base import Tap
+
+REOPEN_S = 0.5
+"""Between attempts to reopen: fast for a plug put back, no load while it stays out."""
+READ_BYTES = 4096
+WRITE_CAP_BYTES = 65_536
+"""Cap of bytes that the port has not taken; a packet of rate 5 is 4,700."""
+
+
+class SerialPort:
+    """Reads and writes what the operating system takes at once; a failing port is reopened.
+
+    While it is away reads are empty and writes are refused, which the caller sees in `is_open`.
+    """
+
+    def __init__(self, path: str, baud: int, tap: Tap | None = None) -> None:
+        self.path, self.baud, self._tap = path, baud, tap
+        self._unsent = bytearray()
+        self._retry_at_s = 0.0
+        self.reopened = 0
+        self.last_error = ""
+        self._serial: serial.Serial | None = self._open()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the port is there."""
+        return self._serial is not None
+
+    def try_reopen(self, now_s: float) -> bool:
+        """Try to open a lost port again when it is time; return whether it came back just now."""
+        if self._serial is not None or now_s < self._retry_at_s:
+            return False
+        self._retry_at_s = now_s + REOPEN_S
+        try:
+            self._serial = self._open()
+        except ModemUnavailable:
+            return False
+        self.reopened += 1
+        return True
+
+    def read(self, now_s: float) -> bytes:
+        """Return what has come, possibly nothing."""
+        data = self._guarded(self._read, now_s) or b""
+        if data and self._tap is not None:
+            self._tap("in", data, now_s)
+        return data
+
+    def write(self, data: bytes, now_s: float) -> None:
+        """Write data behind what is still waiting, as much as the port takes now."""
+        if self._serial is None:
+            return
+        if len(self._unsent) + len(data) <= WRITE_CAP_BYTES:
+            self._unsent += data
+        if self._unsent:
+            self._guarded(self._write, now_s)
+
+    def write_some(self, now_s: float) -> None:
+        """Go on with what the port did not take before."""
+        self.write(b"", now_s)
+
+    def close(self) -> None:
+        """Give the port back for good."""
+        if self._serial is not None:
+            self._serial.close()
+        self._serial, self._retry_at_s = None, float("inf")
+
+    def _open(self) -> serial.Serial:
+        port = serial.Serial(timeout=0, exclusive=True, baudrate=self.baud)
+        port.port = self.path
+        port.rts = False  # before opening: boxes of the Micro-Modem 2 take RTS for power control
+        try:
+            port.open()
+        except (serial.SerialException, OSError) as error:
+            raise ModemUnavailable(_advice(self.path, error)) from error
+        return port
+
+    def _read(self, port: serial.Serial, now_s: float) -> bytes:  # noqa: ARG002
+        if not port.in_waiting:  # raises where the port has gone; a read would return b""
+            return b""
+        return bytes(port.read(READ_BYTES))
+
+    def _write(self, port: serial.Serial, now_s: float) -> bytes:
+        try:
+            count = os.write(port.fileno(), self._unsent)
+        except BlockingIOError:
+            return b""
+        if self._tap is not None:
+            self._tap("out", bytes(self._unsent[:count]), now_s)
+        del self._unsent[:count]
+        return b""
+
+    def _guarded(self, move: Callable[[serial.Serial, float], bytes], now_s: float) -> bytes | None:
+        if self._serial is None:
+            return None
+        try:
+            return move(self._serial, now_s)
+        except (serial.SerialException, OSError, TypeError) as error:
+            # pyserial raises TypeError when its descriptor vanished under it
+            self.last_error = str(error)
+            self._serial.close()
+            self._serial, self._retry_at_s = None, now_s + REOPEN_S
+            self._unsent.clear()
+            return None
+
+
+def _advice(path: str, error: Exception) -> str:
+    """Return one line that says what is wrong with a port and what to do."""
+    if not os.path.exists(path):
+        return f"{path} is not there; plug the modem in, or name another port"
+    if not os.access(path, os.R_OK | os.W_OK):
+        return f"{path} may not be opened by this user; join the group that owns it (dialout)"
+    return f"{path} cannot be opened as a serial port: {error}; is another program using it?"

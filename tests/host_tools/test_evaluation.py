@@ -1,0 +1,344 @@
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+
+from host_tools.evaluation import (
+    draw_map,
+    evaluate,
+    judge_closures,
+    mean_nees,
+    vehicle_errors,
+)
+from host_tools.mapping import DepthMap
+from host_tools.registration import registration_error, tile_shifts
+from host_tools.results import ClosureResult, MissionResult, SoundingPatch, VehicleResult
+from host_tools.scenario import named_scenario
+from host_tools.simulator.placement import Site, Window, place_survey
+from host_tools.simulator.terrain import open_terrain
+from host_tools.simulator.vehicle import SimulatedVehicle, TrueTrack
+from host_tools.writers import body_quaternions, prepare_folder, write_outputs
+from protocol.acoustics import Delivery
+from protocol.errors import ConfigError
+from protocol.settings import replace
+
+
+def straight_track(seconds: int = 101) -> TrueTrack:
+    time_s = np.arange(float(seconds))
+    zero = np.zeros(seconds)
+    return TrueTrack(
+        time_s=time_s,
+        north_m=2.0 * time_s,
+        east_m=zero,
+        depth_m=zero + 10,
+        roll_rad=zero,
+        pitch_rad=zero,
+        yaw_rad=zero,
+    )
+
+
+def vehicle_result(
+    live_off_m: tuple[float, float], final_off_m: tuple[float, float], vehicle: int = 0
+) -> VehicleResult:
+    truth = straight_track()
+    truth_m = np.stack([truth.north_m, truth.east_m], axis=1)
+    return VehicleResult(
+        vehicle=vehicle,
+        truth=truth,
+        dead_reckoning_m=truth_m + truth.time_s[:, None] * [0.3, 0.4],
+        live_m=truth_m + live_off_m,
+        final_m=truth_m + final_off_m,
+        yaw_rad=truth.yaw_rad,
+        final_covariance_m2=np.tile(np.eye(2) * 4.0, (101, 1, 1)),
+    )
+
+
+def closure(**changes: object) -> ClosureResult:
+    values: dict[str, object] = {
+        "t_s": 80.0,
+        "from_vehicle": 0,
+        "from_submap": 0,
+        "from_time_s": 10.0,
+        "to_vehicle": 0,
+        "to_submap": 1,
+        "to_time_s": 60.0,
+        "measured_north_m": 103.0,
+        "measured_east_m": 4.0,
+        "sigma_north_m": 1.0,
+        "sigma_east_m": 1.0,
+        "residual": 0.01,
+        "stage": "gated",
+        "active_at_end": True,
+    }
+    return ClosureResult(**{**values, **changes})  # type: ignore[arg-type]
+
+
+def test_errors_are_unaligned_metres_and_shares_of_dead_reckoning() -> None:
+    errors = vehicle_errors(vehicle_result((3.0, 4.0), (0.0, 1.0)), 50.0)
+    assert errors.distance_m == pytest.approx(200.0)
+    assert errors.dead_reckoning.mean_m == pytest.approx(25.0)
+    assert errors.dead_reckoning.end_m == pytest.approx(50.0)
+    assert errors.live.mean_m == errors.live.rmse_m == errors.live.max_m == pytest.approx(5.0)
+    assert errors.live.share_of_dead_reckoning == pytest.approx(0.2)
+    assert errors.live.percent_of_distance == pytest.approx(2.5)
+    assert errors.live_during_survey.share_of_dead_reckoning == pytest.approx(0.4)
+    assert errors.final.nees == pytest.approx(0.25)
+    assert errors.live.nees is None
+
+
+def test_nees_of_honest_covariances_is_two() -> None:
+    rng = np.random.default_rng(1)
+    covariance_m2 = np.array([[4.0, 1.0], [1.0, 2.0]])
+    error_m = rng.multivariate_normal([0, 0], covariance_m2, 20_000)
+    many = np.tile(covariance_m2, (20_000, 1, 1))
+    assert mean_nees(error_m, many) == pytest.approx(2.0, abs=0.05)
+    many[::2] = np.nan
+    assert mean_nees(error_m, many) == pytest.approx(2.0, abs=0.07)
+    assert mean_nees(error_m, np.full_like(many, np.nan)) is None
+
+
+def test_closure_is_judged_against_the_true_displacement() -> None:
+    vehicles = [vehicle_result((0, 0), (0, 0))]
+    two_axis, north_axis, wrong = judge_closures(
+        [closure(), closure(axis_deg=0.0), closure(measured_north_m=90.0)], vehicles
+    )
+    assert (two_axis.true_north_m, two_axis.true_east_m) == (100.0, 0.0)
+    assert two_axis.error_m == pytest.approx(5.0)
+    assert two_axis.is_valid
+    assert north_axis.error_m == pytest.approx(3.0)
+    assert not wrong.is_valid
+
+
+def small_window(rows: int = 80, columns: int = 80, cell_m: float = 5.0) -> Window:
+    return Window(
+        top_row=0,
+        left_column=0,
+        rows=rows,
+        columns=columns,
+        north0_m=0.0,
+        east0_m=0.0,
+        cell_north_m=cell_m,
+        cell_east_m=cell_m,
+    )
+
+
+def test_map_averages_soundings_by_weight_and_leaves_the_rest_empty() -> None:
+    canvas = DepthMap(small_window())
+    canvas.add(np.array([[10.0, 20.0, 40.0], [11.0, 21.0, 44.0]]), np.array([1.0, 3.0]))
+    canvas.add(np.array([[-900.0, 0.0, 1.0], [0.0, 0.0, np.nan]]))
+    depth_m, sigma_m = canvas.grids()
+    assert depth_m[2, 4] == pytest.approx(41.0, abs=0.01)
+    assert sigma_m[2, 4] > 0.8
+    assert np.isfinite(depth_m).sum() == 1
+
+
+def test_holes_of_a_grid_finer_than_its_soundings_are_filled_near_soundings_only() -> None:
+    canvas = DepthMap(small_window(cell_m=0.5))
+    north_m, east_m = np.meshgrid(np.arange(5.0, 20, 2), np.arange(5.0, 20, 2))
+    canvas.add(np.stack([north_m.ravel(), east_m.ravel(), 30 + north_m.ravel()], 1), 0.01)
+    sparse_m, _ = canvas.grids()
+    depth_m, _ = canvas.grids(1.5)
+    assert np.isfinite(sparse_m[10:38, 10:38]).mean() < 0.1
+    assert np.isfinite(depth_m[10:38, 10:38]).all()
+    assert np.isnan(depth_m[50:, 50:]).all()
+    np.testing.assert_allclose(depth_m[20, 20], 40.0, atol=1.1)
+
+
+def test_patches_move_with_the_final_trajectory_at_the_time_they_were_measured() -> None:
+    vehicle = vehicle_result((0, 0), (0, 0))
+    time_s = np.array([20.0, 80.0])
+    truth_north_m = np.array([50.0, 300.0])
+    patch = SoundingPatch(
+        vehicle=0,
+        north_m=truth_north_m + 0.3 * time_s,
+        east_m=100.0 + 0.4 * time_s,
+        depth_m=np.array([33.0, 44.0]),
+        variance_m2=np.array([0.01, 0.01]),
+        time_s=time_s,
+    )
+    depth_m, _ = draw_map([patch], [vehicle], DepthMap(small_window())).grids()
+    rows, columns = np.nonzero(np.isfinite(depth_m))
+    found = dict(zip(rows.tolist(), depth_m[rows, columns].tolist(), strict=True))
+    assert found == pytest.approx({10: 33.0, 60: 44.0}, abs=0.01)
+    assert columns.tolist() == [20, 20]
+
+
+def relief(rows: int = 120, columns: int = 120, north_m: float = 0.0) -> np.ndarray:
+    n, e = np.meshgrid(np.arange(rows) * 5.0 - north_m, np.arange(columns) * 5.0, indexing="ij")
+    depth_m: np.ndarray = 50 + 2 * np.sin(n / 17) * np.cos(e / 23) + np.sin((n + e) / 31)
+    return depth_m
+
+
+def test_tile_shift_finds_how_far_a_map_is_off() -> None:
+    tiles = tile_shifts(relief(north_m=4.0) + 0.5, relief(), 5.0, 5.0)
+    assert tiles.tiles == 36
+    assert tiles.median_m == pytest.approx(4.0, abs=0.4)
+    same = tile_shifts(relief(), relief(), 5.0, 5.0)
+    assert same.p95_m == 0.0
+
+
+def test_tiles_of_a_flat_or_tilted_plane_do_not_claim_a_shift() -> None:
+    plane_m = 50 + 0.05 * np.add.outer(np.arange(100.0), np.arange(100.0))
+    tiles = tile_shifts(plane_m, plane_m, 5.0, 5.0)
+    assert (tiles.tiles, tiles.flat_tiles) == (0, 25)
+
+
+def test_registration_error_counts_cells_that_both_maps_hold() -> None:
+    truth_m = np.full((10, 10), 40.0)
+    depth_m = truth_m + np.linspace(0, 1.98, 100).reshape(10, 10)
+    depth_m[0] = np.nan
+    error = registration_error(depth_m, truth_m)
+    assert error.cells == 90
+    assert error.share_under_1m == pytest.approx(40 / 90, abs=0.02)
+
+
+def test_quaternion_of_a_level_body_is_its_heading_in_enu() -> None:
+    north, east, starboard_down = body_quaternions(
+        np.array([[0.0, 0.0, 0.0], [np.pi / 2, 0.0, 0.0], [np.pi / 2, 0.0, 0.3]])
+    )
+    half = np.sqrt(0.5)
+    np.testing.assert_allclose(np.abs(north), [0, 0, half, half], atol=1e-12)
+    np.testing.assert_allclose(np.abs(east), [0, 0, 0, 1], atol=1e-12)
+    # heading east, starboard side down: a positive turn about forward, which is east
+    assert starboard_down[0] * starboard_down[3] == pytest.approx(np.sin(0.15) * np.cos(0.15))
+
+
+@pytest.fixture(scope="module")
+def mission() -> MissionResult:
+    scenario = replace(named_scenario("paper-1"), {"duration_min": 2, "follower_duration_min": 1})
+    site: Site = place_survey(open_terrain(None), scenario, 1)
+    truth_map = DepthMap(site.window)
+    vehicles, patches = [], []
+    for index in range(2):
+        soundings: list[np.ndarray] = []
+
+        def keep(points_m: np.ndarray, kept: list[np.ndarray] = soundings) -> None:
+            truth_map.add(points_m)
+            kept.append(points_m)
+
+        simulated = SimulatedVehicle(scenario, site.seabed, index, 1, keep)
+        reckoned, yaw = np.zeros((121, 2)), np.zeros(121)
+        at = np.array(simulated.true_position(0.0)[:2])
+        for odometry, _ in simulated.steps():
+            at += np.array([odometry.velocity_north_mps, odometry.velocity_east_mps]) / 4
+            if odometry.time_s % 1 == 0:
+                reckoned[int(odometry.time_s)], yaw[int(odometry.time_s)] = at, odometry.yaw_rad
+        truth = simulated.true_track()
+        truth_m = np.stack([truth.north_m, truth.east_m], axis=1)
+        points_m = np.concatenate(soundings)
+        still = np.zeros(len(points_m))
+        patches.append(
+            SoundingPatch(
+                vehicle=index,
+                north_m=points_m[:, 0] + (reckoned - truth_m)[0, 0],
+                east_m=points_m[:, 1] + (reckoned - truth_m)[0, 1],
+                depth_m=points_m[:, 2],
+                variance_m2=still + 0.02,
+                time_s=still,
+            )
+        )
+        vehicles.append(
+            VehicleResult(
+                vehicle=index,
+                truth=truth,
+                dead_reckoning_m=reckoned,
+                live_m=0.5 * (reckoned + truth_m),
+                final_m=truth_m,
+                yaw_rad=yaw,
+            )
+        )
+    deliveries = [
+        Delivery(
+            source=1,
+            destination=0,
+            t_tx_s=4.0 * k,
+            t_rx_s=None if k == 3 else 4.0 * k + 0.1,
+            t_delivered_s=4.0 * k + 2.2,
+            frame=bytes(256),
+            fate="lost" if k == 3 else "delivered",
+        )
+        for k in range(10)
+    ]
+    return MissionResult(
+        scenario=scenario,
+        site=site,
+        seed=1,
+        profile="paper",
+        baseline="none",
+        vehicles=vehicles,
+        closures=[closure(), closure(stage="consistent", axis_deg=12.5)],
+        deliveries=deliveries,
+        patches=patches,
+        truth_map=truth_map,
+        counters={"leader": {"pings": 481}},
+        remarks=["rotation about the range is unobservable"],
+    )
+
+
+def test_outputs_are_those_of_the_contract(mission: MissionResult, tmp_path: Path) -> None:
+    write_outputs(mission, evaluate(mission), tmp_path)
+    names = {path.name for path in tmp_path.iterdir()}
+    tracks = {
+        f"{vehicle}_{kind}.tum"
+        for vehicle in ("leader", "follower_1")
+        for kind in ("truth", "dead_reckoning", "live", "final")
+    }
+    fixed = {"summary.json", "closures.csv", "air.jsonl", "map.tif", "map_truth.tif"}
+    assert names == tracks | fixed
+    rows = list(csv.DictReader((tmp_path / "closures.csv").read_text().splitlines()))
+    assert rows[0]["true_north_m"] == "102.889"
+    assert (rows[0]["axis_deg"], rows[1]["axis_deg"], rows[1]["active_at_end"]) == (
+        "",
+        "12.50",
+        "1",
+    )
+    air = [json.loads(line) for line in (tmp_path / "air.jsonl").read_text().splitlines()]
+    assert len(air) == 10
+    assert air[3]["t_rx_s"] is None
+    assert len(air[0]["hex"]) == 512
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["link"]["packets_sent"] == 10
+    assert summary["link"]["packets_lost"] == 1
+    assert summary["link"]["bytes_on_air"] == 2560
+    assert summary["vehicles"]["follower_1"]["live"]["share_of_dead_reckoning"] == pytest.approx(
+        0.5
+    )
+    assert summary["datum"]["shift_m"] == mission.site.datum.depth_shift_m
+
+
+def test_tum_lines_lie_on_one_grid_in_projected_enu(mission: MissionResult, tmp_path: Path) -> None:
+    write_outputs(mission, evaluate(mission), tmp_path)
+    rows = np.loadtxt(tmp_path / "follower_1_truth.tum")
+    np.testing.assert_array_equal(rows[:, 0], np.arange(121.0))
+    datum = mission.site.datum
+    np.testing.assert_allclose(
+        rows[0, 1:4], [datum.origin_east_m + 50, datum.origin_north_m + 50, -10.0], atol=1e-3
+    )
+    np.testing.assert_allclose(np.linalg.norm(rows[:, 4:], axis=1), 1.0, atol=1e-6)
+
+
+def test_map_of_true_soundings_lies_on_the_terrain(mission: MissionResult, tmp_path: Path) -> None:
+    evaluation = evaluate(mission)
+    write_outputs(mission, evaluation, tmp_path)
+    terrain = mission.site.raster
+    with rasterio.open(tmp_path / "map_truth.tif") as dataset:
+        assert dataset.shape == (terrain.rows, terrain.columns)
+        assert dataset.transform == terrain.transform
+        assert dataset.count == 2
+        elevation_m, sigma_m = dataset.read(1, masked=True), dataset.read(2, masked=True)
+    difference_m = elevation_m - terrain.read(0, 0, terrain.rows, terrain.columns)
+    assert difference_m.count() > 1000
+    assert abs(float(np.median(difference_m.compressed()))) < 0.02
+    assert float(difference_m.std()) < 0.25
+    assert sigma_m.count() == elevation_m.count()
+    assert evaluation.registration.mean_m < 1e-2
+
+
+def test_unwritable_output_is_a_clear_error(tmp_path: Path) -> None:
+    blocker = tmp_path / "file"
+    blocker.write_text("")
+    with pytest.raises(ConfigError, match="cannot write to --out"):
+        prepare_folder(blocker / "out")

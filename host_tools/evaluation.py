@@ -64,7 +64,7 @@ class JudgedClosure:
     true_east_m: float
     error_m: float
 
-    @determinant_m4ty
+    @property
     def is_valid(self) -> bool:
         """Whether it is right within 5 m."""
         return self.error_m <= VALID_CLOSURE_M
@@ -152,7 +152,7 @@ def _trajectory_errors(
 def mean_nees(error_m: Array, covariance_m2: Array) -> float | None:
     """Return the time average of e' P^-1 e over the known covariances (2 when they are honest)."""
     finite = np.isfinite(np.column_stack([error_m, covariance_m2.reshape(-1, 4)])).all(axis=1)
-    determinant_m4 = np.linalg.det(np.where(finite[:, None, None], covariance_m2, 0.0))
+    determinant_m4 = np.linalg.det(np.where(np.reshape(finite, (-1, 1, 1)), covariance_m2, 0.0))
     known = np.flatnonzero(finite & (determinant_m4 > 1e-12))
     if known.size == 0:
         return None

@@ -74,10 +74,11 @@ def flatten(settings: Settings, prefix: str = "") -> Iterator[tuple[str, object,
             yield key, value, field.metadata.get("unit", ""), field.metadata.get("why", "")
 
 
-def replace(settings: T, changes: Mapping[str, object]) -> T:
+def replace(settings: T, changes: Mapping[str, object], prefer: str = "") -> T:
     """Return settings with changes given as dotted keys; text is read as the field's type.
 
-    A key may leave out the path when its last name occurs once in the tree.
+    A key may leave out the path when its last name occurs once in the tree, or in the subtree
+    that is preferred.
 
     Raises
     ------
@@ -86,14 +87,16 @@ def replace(settings: T, changes: Mapping[str, object]) -> T:
     """
     known = [key for key, *_ in flatten(settings)]
     for name, value in changes.items():
-        settings = _replace_one(settings, _resolve(name, known), value)
+        settings = _replace_one(settings, _resolve(name, known, prefer), value)
     return settings
 
 
-def _resolve(name: str, known: list[str]) -> list[str]:
+def _resolve(name: str, known: list[str], prefer: str) -> list[str]:
     if name in known:
         return name.split(".")
     matches = [key for key in known if key.endswith("." + name)]
+    preferred = [key for key in matches if key.startswith(prefer + ".")]
+    matches = preferred if len(preferred) == 1 else matches
     if len(matches) == 1:
         return matches[0].split(".")
     if matches:
@@ -107,11 +110,11 @@ def _replace_one(settings: T, path: list[str], value: object) -> T:
         changed: object = _replace_one(getattr(settings, name), rest, value)
     else:
         changed = _read(name, value, typing.get_type_hints(type(settings))[name])
-    return dataclasses.replace(settings, **{name: changed})  # type: ignore[arg-type]
+    return dataclasses.replace(settings, **{name: changed})
 
 
 def _read(name: str, value: object, kind: Any) -> object:  # noqa: ANN401
-    """Return the value as `kind`: bool, int, float, str, one of these or None, or a tuple of them."""
+    """Return the value as `kind`: bool, int, float or str, or None, or a tuple of one of them."""
     if typing.get_origin(kind) in {typing.Union, types.UnionType}:
         if value is None or (isinstance(value, str) and value.lower() in {"", "none"}):
             return None

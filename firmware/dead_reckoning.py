@@ -1,0 +1,59 @@
+"""Dead reckoning: the Doppler log's velocity, integrated. Never corrected by anything."""
+
+import math
+from dataclasses import dataclass
+
+from firmware.soundings import Odometry
+
+_LONGEST_STEP_S = 5.0  # a longer gap is not bridged with one velocity: the position is held
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReckonedState:
+    """Where dead reckoning believes the vehicle to be at one instant."""
+
+    time_s: float
+    north_m: float
+    east_m: float
+    yaw_rad: float
+    depth_m: float
+
+
+class DeadReckoning:
+    """Integrates odometry from a start; bad samples are counted and the last velocity is kept."""
+
+    def __init__(self, start: ReckonedState) -> None:
+        self.state = start
+        self.bad_samples = 0
+        self._velocity_mps = (0.0, 0.0)
+
+    def receive_odometry(self, odometry: Odometry) -> ReckonedState:
+        """Advance to the sample's time with its mean velocity since the last one; return the state.
+
+        Non-finite velocities are replaced by the last good ones; samples that go back in time,
+        or carry no finite time, are dropped.
+        """
+        interval_s = odometry.time_s - self.state.time_s
+        if not math.isfinite(interval_s) or interval_s < 0.0:
+            self.bad_samples += 1
+            return self.state
+        velocity_mps = (odometry.velocity_north_mps, odometry.velocity_east_mps)
+        if all(map(math.isfinite, velocity_mps)):
+            self._velocity_mps = velocity_mps
+        else:
+            self.bad_samples += 1
+        if interval_s > _LONGEST_STEP_S:
+            self.bad_samples += 1
+            interval_s = 0.0
+        self.state = ReckonedState(
+            time_s=odometry.time_s,
+            north_m=self.state.north_m + self._velocity_mps[0] * interval_s,
+            east_m=self.state.east_m + self._velocity_mps[1] * interval_s,
+            yaw_rad=_finite(odometry.yaw_rad, self.state.yaw_rad),
+            depth_m=_finite(odometry.depth_m, self.state.depth_m),
+        )
+        return self.state
+
+
+def _finite(value: float, otherwise: float) -> float:
+    return value if math.isfinite(value) else otherwise

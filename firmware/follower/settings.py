@@ -1,0 +1,29 @@
+"""The configuration of a follower: one frozen tree that gathers the settings of its parts."""
+
+from dataclasses import dataclass
+
+from firmware.compression.settings import BinningSettings, CompressionSettings
+from firmware.follower.correction import CorrectionSettings
+from firmware.soundings import SonarSettings
+from firmware.submap_builder import SubmapSettings
+from protocol.settings import Settings, setting
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FollowerSettings(Settings):
+    """Everything that a follower may be told."""
+
+    profile: str = setting(
+        "paper", "", "what a sub-map is sent as", choices=("paper", "dense", "lattice")
+    )
+    sonar: SonarSettings = setting(SonarSettings, "", "the multibeam sonar")
+    submaps: SubmapSettings = setting(SubmapSettings, "", "what a sub-map is")
+    binning: BinningSettings = setting(BinningSettings, "", "how soundings are thinned")
+    compression: CompressionSettings = setting(CompressionSettings, "", "the fit")
+    correction: CorrectionSettings = setting(CorrectionSettings, "", "use of the answers")
+    steps_per_tick: int = setting(
+        4, "steps", "of the fit between two pings; a sub-map's fit then ends within 4 s", minimum=1
+    )
+    track_s: float = setting(
+        600.0, "s", "of own track kept to place answers by; they are two minutes old", minimum=60.0
+    )

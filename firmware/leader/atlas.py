@@ -1,0 +1,93 @@
+"""The sub-maps that the leader holds, its own and those rebuilt from frames."""
+
+from collections import OrderedDict
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from firmware.geometry import Array
+from firmware.leader.trajectory import Trajectory
+from firmware.leader.warping import remove_drift
+from firmware.submaps import GriddedSubmap, Track
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SheetId:
+    """Which sub-map of which vehicle, in which of its boot epochs."""
+
+    vehicle: int
+    boot_epoch: int
+    submap: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sheet:
+    """A gridded sub-map in raw dead reckoning, with the track it was measured from."""
+
+    id: SheetId
+    track: Track
+    grid: GriddedSubmap
+    reconstructed: bool
+    time_s: float  # the middle of the measurement: the grid is warped to agree at this instant
+    centre_m: Array  # (2,) middle of the known cells, raw dead reckoning
+    radius_m: float  # half the diagonal of their extent
+
+    def reckoned_at(self, time_s: float) -> Array:
+        """Return the vehicle's raw dead-reckoned position (2,) at the time."""
+        return self.track.position_at(time_s)
+
+    def without_drift(self, trajectory: Trajectory) -> tuple[GriddedSubmap, Array]:
+        """Return the grid with the estimated drift taken out about `time_s`, and that drift."""
+        drift_mps = trajectory.drift_at(self.time_s)
+        grid = remove_drift(self.grid, float(drift_mps[0]), float(drift_mps[1]), self.time_s)
+        return grid, drift_mps
+
+
+def sheet_of(
+    sheet_id: SheetId, track: Track, grid: GriddedSubmap, *, reconstructed: bool
+) -> Sheet | None:
+    """Return the sheet of a grid, or None if no cell of it is known."""
+    rows, columns = np.nonzero(np.isfinite(grid.depth_m))
+    if rows.size == 0:
+        return None
+    origin_m = np.array([grid.north0_m, grid.east0_m])
+    low_m = origin_m + grid.cell_m * np.array([rows.min(), columns.min()])
+    high_m = origin_m + grid.cell_m * np.array([rows.max(), columns.max()])
+    return Sheet(
+        id=sheet_id,
+        track=track,
+        grid=grid,
+        reconstructed=reconstructed,
+        time_s=float(np.nanmedian(grid.time_s)),
+        centre_m=(low_m + high_m) / 2,
+        radius_m=float(np.hypot(*(high_m - low_m)) / 2),
+    )
+
+
+class Atlas:
+    """Sheets by id in the order of their arrival; the oldest go when the cap is reached."""
+
+    def __init__(self, capacity: int) -> None:
+        self._capacity = capacity
+        self._sheets: OrderedDict[SheetId, Sheet] = OrderedDict()
+        self.dropped = 0
+
+    def __len__(self) -> int:
+        return len(self._sheets)
+
+    def __iter__(self) -> Iterator[Sheet]:
+        return iter(self._sheets.values())
+
+    def __contains__(self, sheet_id: SheetId) -> bool:
+        return sheet_id in self._sheets
+
+    def __getitem__(self, sheet_id: SheetId) -> Sheet:
+        return self._sheets[sheet_id]
+
+    def add(self, sheet: Sheet) -> None:
+        """Keep a sheet; a better version of a known one takes its place."""
+        self._sheets[sheet.id] = sheet
+        if len(self._sheets) > self._capacity:
+            self._sheets.popitem(last=False)
+            self.dropped += 1

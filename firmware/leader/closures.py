@@ -1,0 +1,216 @@
+"""Loop closures: which pairs of sub-maps to match, and what becomes of what the match finds."""
+
+import enum
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from firmware.geometry import Array
+from firmware.leader.atlas import Atlas, Sheet, SheetId
+from firmware.leader.ledger import Anchor
+from firmware.leader.matching import MatchingSettings, MatchOutcome, match
+from firmware.leader.pose_graph import PoseGraph
+from firmware.submaps import GriddedSubmap
+from protocol.errors import EstimationError
+from protocol.settings import Settings, setting
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClosureSettings(Settings):
+    """How many pairs are tried, and what a closure must withstand."""
+
+    pairs_per_submap: int = setting(
+        12, "pairs", "bounds the work of one sub-map to a tenth of a second", minimum=1
+    )
+    screened_per_submap: int = setting(
+        48, "sub-maps", "nearest ones whose joint covariance is asked for", minimum=1
+    )
+    shortest_gap_s: float = setting(
+        80.0, "s", "nearer in time, dead reckoning knows more than a match", minimum=0.0
+    )
+    overlap_sigmas: float = setting(
+        2.0, "1", "how far beyond touching a pair may be predicted", minimum=0.0
+    )
+    gate_chi_square: float = setting(
+        13.8, "1", "99.9 % of true innovations of two components pass", minimum=1.0
+    )
+
+
+class Stage(enum.StrEnum):
+    """The last test that a closure has passed."""
+
+    DETECTED = "detected"
+    GATED = "gated"
+    CONSISTENT = "consistent"
+
+
+@dataclass(slots=True, kw_only=True)
+class Closure:
+    """A detected closure: the offset of `target` from `origin` (2,) and how far it has come."""
+
+    time_s: float
+    origin: SheetId
+    target: SheetId
+    origin_anchor: Anchor
+    target_anchor: Anchor
+    offset_m: Array
+    covariance_m2: Array
+    residual: float
+    axis_deg: float | None
+    stage: Stage = Stage.DETECTED
+    number: int | None = None  # in the ledger, once gated
+    active: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MatchJob:
+    """Everything one match needs, so that it can run beside the loop."""
+
+    origin: Sheet
+    target: Sheet
+    origin_grid: GriddedSubmap
+    target_grid: GriddedSubmap
+    origin_drift_mps: Array
+    target_drift_mps: Array
+    prior_shift_m: Array
+    prior_covariance_m2: Array
+    settings: MatchingSettings
+
+    def run(self) -> MatchOutcome:
+        """Match the pair."""
+        return match(
+            self.origin_grid,
+            self.target_grid,
+            self.prior_shift_m,
+            self.prior_covariance_m2,
+            self.settings,
+            reference_reconstructed=self.origin.reconstructed,
+            query_reconstructed=self.target.reconstructed,
+        )
+
+
+def jobs_for(
+    sheet: Sheet,
+    atlas: Atlas,
+    graph: PoseGraph,
+    settings: ClosureSettings,
+    matching: MatchingSettings,
+) -> list[MatchJob]:
+    """Return the matches worth trying for a new sheet, most overlap first, bounded in number."""
+    here_m = _estimated_centre(sheet, graph)
+    others = [
+        other
+        for other in atlas
+        if other.id != sheet.id
+        and (
+            other.id.vehicle != sheet.id.vehicle
+            or abs(other.time_s - sheet.time_s) >= settings.shortest_gap_s
+        )
+    ]
+    distances_m = {o.id: float(np.hypot(*(_estimated_centre(o, graph) - here_m))) for o in others}
+    nearest = sorted(others, key=lambda o: distances_m[o.id])[: settings.screened_per_submap]
+    ranked = []
+    for other in nearest:
+        try:
+            covariance_m2 = _relative_covariance(other, sheet, graph)
+        except EstimationError:
+            continue
+        spread_m = float(np.sqrt(np.linalg.eigvalsh(covariance_m2)[-1]))
+        beyond_m = max(distances_m[other.id] - 0.8 * (sheet.radius_m + other.radius_m), 0.0)
+        if beyond_m <= settings.overlap_sigmas * spread_m + 1.0:
+            ranked.append((distances_m[other.id], other, covariance_m2))
+    ranked.sort(key=lambda item: item[0])
+    grid, drift_mps = sheet.without_drift(graph.trajectory(sheet.id.vehicle))
+    jobs = []
+    for _, other, covariance_m2 in ranked[: settings.pairs_per_submap]:
+        other_grid, other_drift_mps = other.without_drift(graph.trajectory(other.id.vehicle))
+        jobs.append(
+            MatchJob(
+                origin=other,
+                target=sheet,
+                origin_grid=other_grid,
+                target_grid=grid,
+                origin_drift_mps=other_drift_mps,
+                target_drift_mps=drift_mps,
+                prior_shift_m=_correction(sheet, graph) - _correction(other, graph),
+                prior_covariance_m2=covariance_m2,
+                settings=matching,
+            )
+        )
+    return jobs
+
+
+def closure_of(
+    job: MatchJob, outcome: MatchOutcome, graph: PoseGraph, now_s: float
+) -> Closure | None:
+    """Return the closure that a match found, or None.
+
+    The shift lies between the grids as they agree with dead reckoning at their own instants; the
+    closure is stated between the positions at the mean times of the overlap.
+    """
+    if outcome.match is None:
+        return None
+    found = outcome.match
+    ends_m, anchors = [], []
+    for sheet, drift_mps, time_s in (
+        (job.origin, job.origin_drift_mps, found.reference_time_s),
+        (job.target, job.target_drift_mps, found.query_time_s),
+    ):
+        ends_m.append(sheet.reckoned_at(time_s) - drift_mps * (time_s - sheet.time_s))
+        anchors.append(graph.anchor(sheet.id.vehicle, time_s, sheet.track))
+    return Closure(
+        time_s=now_s,
+        origin=job.origin.id,
+        target=job.target.id,
+        origin_anchor=anchors[0],
+        target_anchor=anchors[1],
+        offset_m=ends_m[1] + found.shift_m - ends_m[0],
+        covariance_m2=found.covariance_m2,
+        residual=found.residual,
+        axis_deg=found.axis_deg,
+    )
+
+
+def gate(closure: Closure, graph: PoseGraph, settings: ClosureSettings) -> bool:
+    """Enter a closure in the ledger if the graph finds its innovation possible; say whether."""
+    joint_m2 = graph.covariance([closure.origin_anchor, closure.target_anchor])
+    between = np.hstack([-np.eye(2), np.eye(2)])
+    spread_m2 = between @ joint_m2 @ between.T + closure.covariance_m2
+    predicted_m = graph.position(closure.target_anchor) - graph.position(closure.origin_anchor)
+    innovation_m = closure.offset_m - predicted_m
+    if innovation_m @ np.linalg.solve(spread_m2, innovation_m) > settings.gate_chi_square:
+        return False
+    closure.stage = Stage.GATED
+    closure.number = graph.add_closure(
+        closure.origin_anchor,
+        closure.target_anchor,
+        closure.offset_m,
+        closure.covariance_m2,
+        active=False,
+    )
+    return True
+
+
+def count_stages(closures: Iterable[Closure]) -> dict[str, int]:
+    """Return how many closures reached each stage last, and how many are active."""
+    closures = list(closures)
+    counts = Counter(closure.stage.value for closure in closures)
+    return {**{s.value: counts[s.value] for s in Stage}, "active": sum(c.active for c in closures)}
+
+
+def _correction(sheet: Sheet, graph: PoseGraph) -> Array:
+    trajectory = graph.trajectory(sheet.id.vehicle)
+    reckoned_m = sheet.reckoned_at(sheet.time_s)
+    return trajectory.correct(sheet.time_s, reckoned_m) - reckoned_m
+
+
+def _estimated_centre(sheet: Sheet, graph: PoseGraph) -> Array:
+    return sheet.centre_m + _correction(sheet, graph)
+
+
+def _relative_covariance(origin: Sheet, target: Sheet, graph: PoseGraph) -> Array:
+    anchors = [graph.anchor(s.id.vehicle, s.time_s, s.track) for s in (origin, target)]
+    between = np.hstack([-np.eye(2), np.eye(2)])
+    return np.asarray(between @ graph.covariance(anchors) @ between.T)

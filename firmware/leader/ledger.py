@@ -1,0 +1,111 @@
+"""What the pose graph has been told, as plain records: the graph can be rebuilt from them alone.
+
+Node states are (north, east, bias north, bias east); a vehicle's parameters are (heading bias in
+rad, log scale). Every record computes its own error, in the units of its sigmas.
+"""
+
+import enum
+from dataclasses import dataclass
+
+import numpy as np
+
+from firmware.geometry import Array
+
+
+class FactorKind(enum.StrEnum):
+    """What a factor stands for."""
+
+    PRIOR = "prior"
+    ODOMETRY = "odometry"
+    CLOSURE = "closure"
+    RANGE = "range"
+    ABSOLUTE = "absolute"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Anchor:
+    """A node, and the offset by dead reckoning from it to the position that is meant."""
+
+    key: int
+    offset_m: Array  # (2,)
+    time_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PriorRecord:
+    """A Gaussian belief about a whole variable: mean and sigmas of equal length."""
+
+    key: int
+    mean: Array
+    sigmas: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OdometryRecord:
+    """Dead reckoning between two nodes: moved_m (2,) in interval_s, with the noise of both parts.
+
+    Its error is the first line of Eq. 11: x' - x - moved + bias dt + heading J moved + scale moved,
+    where J turns by +90 degrees; the bias wanders.
+    """
+
+    origin: int
+    target: int
+    parameters: int
+    moved_m: Array
+    interval_s: float
+    position_sigma_m: float
+    bias_sigma_mps: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClosureRecord:
+    """A loop closure: position of target minus position of origin (2,), with its covariance."""
+
+    origin: Anchor
+    target: Anchor
+    offset_m: Array
+    covariance_m2: Array  # (2, 2)
+
+    def innovation_m(self, origin_m: Array, target_m: Array) -> Array:
+        """Return estimated minus measured offset (2,) for node positions (2,)."""
+        return np.asarray(
+            target_m + self.target.offset_m - origin_m - self.origin.offset_m - self.offset_m
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RangeRecord:
+    """A one-way range between two anchors: the third line of Eq. 11."""
+
+    origin: Anchor
+    target: Anchor
+    range_m: float
+    sigma_m: float
+
+    def innovation_m(self, origin_m: Array, target_m: Array) -> tuple[float, Array]:
+        """Return estimated minus measured range, and the unit vector (2,) from origin to target."""
+        between_m = target_m + self.target.offset_m - origin_m - self.origin.offset_m
+        distance_m = float(np.hypot(*between_m))
+        direction = between_m / distance_m if distance_m > 1e-6 else np.array([1.0, 0.0])
+        return distance_m - self.range_m, direction
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AbsoluteRecord:
+    """An absolute horizontal position (GNSS at the surface, USBL) of an anchor."""
+
+    anchor: Anchor
+    position_m: Array
+    covariance_m2: Array
+
+
+Record = PriorRecord | OdometryRecord | ClosureRecord | RangeRecord | AbsoluteRecord
+
+
+@dataclass(slots=True)
+class Entry:
+    """A record, whether the estimate uses it, and the slot in which the solver holds it."""
+
+    record: Record
+    active: bool
+    slot: int | None = None

@@ -1,0 +1,449 @@
+"""The pose graph of all vehicles (Eq. 11), incremental in gtsam, rebuilt at will from its ledger.
+
+A node is a vehicle's position and dead-reckoning bias at one of the common epochs. Dead reckoning
+is a linear factor between consecutive nodes; it carries the bias as a velocity that wanders, and
+one heading bias and log scale per vehicle. Closures and ranges speak of arbitrary times; they are
+moved to the nearest node by dead reckoning, so that no node is ever inserted between two others.
+
+The ISAM2 object is a cache of the ledger: poisoned as soon as it raises, and rebuilt.
+"""
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import SuperLU, splu
+
+from firmware.geometry import Array
+from firmware.leader.ledger import (
+    AbsoluteRecord,
+    Anchor,
+    ClosureRecord,
+    Entry,
+    OdometryRecord,
+    PriorRecord,
+    RangeRecord,
+    Record,
+)
+from firmware.leader.trajectory import Trajectory
+from firmware.submaps import Track
+from protocol.errors import EstimationError
+from protocol.settings import Settings, setting
+
+_QUARTER_TURN = np.array([[0.0, -1.0], [1.0, 0.0]])
+_POSITION = np.eye(2, 4)  # takes a node's state to its position
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GraphSettings(Settings):
+    """What the graph believes of dead reckoning, closures and ranges."""
+
+    node_interval_s: float = setting(
+        10.0, "s", "key-frame spacing; dead reckoning adds 0.6 m of noise in it", minimum=1.0
+    )
+    start_sigma_m: float = setting(
+        0.5, "m", "uncertainty of each start in the common datum", minimum=1e-3
+    )
+    odometry_noise: float = setting(
+        0.2, "m/sqrt(s)", "random part of dead reckoning: variance 0.04 a second", minimum=1e-4
+    )
+    bias_sigma_mps: float = setting(
+        0.2, "m/s", "unmeasured current at the start, each axis", minimum=1e-4
+    )
+    bias_walk: float = setting(
+        0.0008, "m/s/sqrt(s)", "lets a current of 0.2 m/s turn within hours", minimum=1e-7
+    )
+    heading_bias_sigma_deg: float = setting(
+        0.5, "degree", "mounting error of the attitude reference", minimum=1e-6
+    )
+    log_scale_sigma: float = setting(0.005, "1", "scale error of the Doppler log", minimum=1e-9)
+    range_sigma_m: float = setting(1.0, "m", "noise of a one-way range (Eq. 13)", minimum=1e-3)
+    closure_floor_m: float = setting(
+        0.4, "m", "strain within a sub-map that no match can see", minimum=0.0
+    )
+    robust_kernel: float = setting(
+        5.0, "sigma^2", "Phi of dynamic covariance scaling on closures and ranges", minimum=0.1
+    )
+
+
+@dataclass(slots=True)
+class _Chain:
+    """The nodes of one vehicle, in time order, and the key of its parameters."""
+
+    number: int
+    parameters: int
+    times_s: list[float] = field(default_factory=list)
+    reckoned_m: list[Array] = field(default_factory=list)
+    keys: list[int] = field(default_factory=list)
+
+
+class PoseGraph:
+    """Every vehicle's trajectory, and what ties them together."""
+
+    def __init__(self, settings: GraphSettings) -> None:
+        self._settings = settings
+        self._chains: dict[int, _Chain] = {}
+        self._ledger: list[Entry] = []
+        self._changed: set[int] = set()
+        self._values = gtsam.Values()
+        self._fresh = gtsam.Values()
+        self._isam = _new_isam()
+        self._factorised: tuple[SuperLU, dict[int, int]] | None = None
+        self._trajectories: dict[int, Trajectory] = {}  # until the next change
+        self.rebuilds = 0
+
+    def add_vehicle(self, vehicle: int, time_s: float, reckoned_m: Array, start_m: Array) -> None:
+        """Start a vehicle's chain at a position (2,) known to the settings' uncertainty."""
+        s = self._settings
+        number = len(self._chains)
+        chain = _Chain(number=number, parameters=gtsam.symbol("p", number))
+        self._chains[vehicle] = chain
+        state = np.concatenate([start_m, np.zeros(2)])
+        key = self._append(chain, time_s, reckoned_m, state)
+        self._fresh.insert(chain.parameters, np.zeros(2))
+        sigmas = np.repeat([s.start_sigma_m, s.bias_sigma_mps], 2)
+        self._enter(PriorRecord(key=key, mean=state, sigmas=sigmas))
+        calibration = np.array([np.radians(s.heading_bias_sigma_deg), s.log_scale_sigma])
+        self._enter(PriorRecord(key=chain.parameters, mean=np.zeros(2), sigmas=calibration))
+
+    def vehicles(self) -> list[int]:
+        """Return the vehicles that have a chain."""
+        return list(self._chains)
+
+    def extend(self, vehicle: int, track: Track) -> int:
+        """Add the nodes that a vehicle's newly known track allows; return how many.
+
+        Epochs in a gap of the track are passed over: positions are composed, so the next node
+        ties to the last across the gap.
+        """
+        chain, interval_s = self._chains[vehicle], self._settings.node_interval_s
+        first = int(np.floor(chain.times_s[-1] / interval_s + 1e-9)) + 1
+        last = int(np.floor(track.time_s[-1] / interval_s + 1e-9))
+        added = 0
+        for epoch in range(first, last + 1):
+            time_s = epoch * interval_s
+            if np.min(np.abs(track.time_s - time_s)) <= interval_s / 2:
+                self._step(chain, time_s, track.position_at(time_s))
+                added += 1
+        return added
+
+    def anchor(self, vehicle: int, time_s: float, track: Track) -> Anchor:
+        """Return the node nearest in time, and the offset from it to the position at the time.
+
+        Raises EstimationError if the vehicle has no node within two intervals of the time.
+        """
+        if vehicle not in self._chains:
+            raise EstimationError(f"vehicle {vehicle} has no chain in the graph")
+        chain = self._chains[vehicle]
+        nearest = int(np.argmin(np.abs(np.asarray(chain.times_s) - time_s)))
+        lag_s = time_s - chain.times_s[nearest]
+        if abs(lag_s) > 2 * self._settings.node_interval_s:
+            raise EstimationError(
+                f"vehicle {vehicle} has no node near {time_s:.1f} s; the nearest is at "
+                f"{chain.times_s[nearest]:.1f} s"
+            )
+        bias_mps = self._state(chain.keys[nearest])[2:]
+        moved_m = track.position_at(time_s) - chain.reckoned_m[nearest]
+        return Anchor(key=chain.keys[nearest], offset_m=moved_m - bias_mps * lag_s, time_s=time_s)
+
+    def add_closure(
+        self, origin: Anchor, target: Anchor, offset_m: Array, covariance_m2: Array, *, active: bool
+    ) -> int:
+        """Enter a closure, target minus origin (2,) in metres, and return its number."""
+        floor_m2 = self._settings.closure_floor_m**2
+        record = ClosureRecord(
+            origin=origin,
+            target=target,
+            offset_m=offset_m,
+            covariance_m2=covariance_m2 + floor_m2 * np.eye(2),
+        )
+        return self._enter(record, active=active)
+
+    def add_range(self, origin: Anchor, target: Anchor, range_m: float) -> int:
+        """Enter a one-way range between two anchors, active, and return its number."""
+        sigma_m = self._settings.range_sigma_m
+        return self._enter(
+            RangeRecord(origin=origin, target=target, range_m=range_m, sigma_m=sigma_m)
+        )
+
+    def add_absolute(self, anchor: Anchor, position_m: Array, covariance_m2: Array) -> int:
+        """Enter an absolute position (2,) of an anchor, active, and return its number."""
+        return self._enter(
+            AbsoluteRecord(anchor=anchor, position_m=position_m, covariance_m2=covariance_m2)
+        )
+
+    def set_active(self, number: int, *, active: bool) -> None:
+        """Take a record into the estimate, or out of it, from the next update on."""
+        entry = self._ledger[number]
+        if entry.active != active:
+            entry.active = active
+            self._changed.add(number)
+
+    def record(self, number: int) -> Record:
+        """Return a record of the ledger."""
+        return self._ledger[number].record
+
+    def update(self) -> None:
+        """Bring the estimate up to the ledger: incrementally, or from scratch if gtsam gives up."""
+        if not self._changed and self._fresh.size() == 0:
+            return
+        added, numbers, removed = gtsam.NonlinearFactorGraph(), [], []
+        for number in sorted(self._changed):
+            entry = self._ledger[number]
+            if entry.active and entry.slot is None:
+                added.push_back(_factor(entry.record, self._settings.robust_kernel))
+                numbers.append(number)
+            elif not entry.active and entry.slot is not None:
+                removed.append(entry.slot)
+                entry.slot = None
+        try:
+            result = self._isam.update(added, self._fresh, removed)
+            for number, slot in zip(numbers, result.getNewFactorsIndices(), strict=True):
+                self._ledger[number].slot = slot
+            self._values = self._isam.calculateEstimate()
+        except RuntimeError:
+            self._values.insert(self._fresh)
+            self._rebuild(self._values)
+        self._fresh = gtsam.Values()
+        self._changed.clear()
+        self._forget_solution()
+
+    def solve_batch(self) -> None:
+        """Solve the ledger from scratch by Levenberg-Marquardt and restart ISAM2 from there."""
+        self.update()
+        parameters = gtsam.LevenbergMarquardtParams()
+        parameters.setLinearSolverType("MULTIFRONTAL_QR")
+        graph, _ = self._active_factors()
+        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, self._values, parameters)
+        self._rebuild(optimizer.optimize())
+
+    def trajectory(self, vehicle: int) -> Trajectory:
+        """Return the estimate of one vehicle at all of its nodes."""
+        if vehicle not in self._trajectories:
+            chain = self._chains[vehicle]
+            states = np.array([self._state(key) for key in chain.keys])
+            self._trajectories[vehicle] = Trajectory(
+                time_s=np.array(chain.times_s),
+                reckoned_m=np.array(chain.reckoned_m),
+                position_m=states[:, :2],
+                bias_mps=states[:, 2:],
+            )
+        return self._trajectories[vehicle]
+
+    def parameters(self, vehicle: int) -> Array:
+        """Return a vehicle's heading bias in rad and log scale, (2,)."""
+        return self._state(self._chains[vehicle].parameters)
+
+    def position(self, anchor: Anchor) -> Array:
+        """Return the estimated position (2,) of an anchor."""
+        return self._state(anchor.key)[:2] + anchor.offset_m
+
+    def covariance(self, anchors: list[Anchor]) -> Array:
+        """Return the joint covariance (2A, 2A) in m^2 of the positions of A anchors.
+
+        Raises EstimationError if the information matrix is singular.
+        """
+        solver, columns = self._factorisation()
+        rows = np.array([columns[a.key] + axis for a in anchors for axis in (0, 1)])
+        unit = np.zeros((solver.shape[0], rows.size))
+        unit[rows, np.arange(rows.size)] = 1.0
+        return np.asarray(solver.solve(unit)[rows])
+
+    def innovation(self, number: int) -> Array:
+        """Return estimated minus measured offset (2,) of a closure, in metres."""
+        record = self._ledger[number].record
+        if not isinstance(record, ClosureRecord):
+            raise EstimationError(f"record {number} is not a closure")
+        return record.innovation_m(
+            self._state(record.origin.key)[:2], self._state(record.target.key)[:2]
+        )
+
+    def _append(self, chain: _Chain, time_s: float, reckoned_m: Array, state: Array) -> int:
+        key: int = gtsam.symbol("x", (chain.number << 24) | len(chain.keys))
+        chain.times_s.append(time_s)
+        chain.reckoned_m.append(np.asarray(reckoned_m, dtype=np.float64))
+        chain.keys.append(key)
+        self._fresh.insert(key, np.asarray(state, dtype=np.float64))
+        self._trajectories.clear()
+        return key
+
+    def _step(self, chain: _Chain, time_s: float, reckoned_m: Array) -> None:
+        s = self._settings
+        before, interval_s = chain.keys[-1], time_s - chain.times_s[-1]
+        moved_m = reckoned_m - chain.reckoned_m[-1]
+        state = self._state(before).copy()
+        state[:2] += moved_m - state[2:] * interval_s
+        self._enter(
+            OdometryRecord(
+                origin=before,
+                target=self._append(chain, time_s, reckoned_m, state),
+                parameters=chain.parameters,
+                moved_m=moved_m,
+                interval_s=interval_s,
+                position_sigma_m=s.odometry_noise * np.sqrt(interval_s),
+                bias_sigma_mps=s.bias_walk * np.sqrt(interval_s),
+            )
+        )
+
+    def _enter(self, record: Record, *, active: bool = True) -> int:
+        self._ledger.append(Entry(record=record, active=active))
+        number = len(self._ledger) - 1
+        if active:
+            self._changed.add(number)
+        return number
+
+    def _state(self, key: int) -> Array:
+        values = self._values if self._values.exists(key) else self._fresh
+        return np.asarray(values.atVector(key))
+
+    def _active_factors(self) -> tuple[gtsam.NonlinearFactorGraph, list[Entry]]:
+        graph, entries = gtsam.NonlinearFactorGraph(), []
+        for entry in self._ledger:
+            if entry.active:
+                graph.push_back(_factor(entry.record, self._settings.robust_kernel))
+                entries.append(entry)
+        return graph, entries
+
+    def _rebuild(self, values: gtsam.Values) -> None:
+        for entry in self._ledger:
+            entry.slot = None
+        graph, entries = self._active_factors()
+        self._isam = _new_isam()
+        result = self._isam.update(graph, values)
+        for entry, slot in zip(entries, result.getNewFactorsIndices(), strict=True):
+            entry.slot = slot
+        self._values = self._isam.calculateEstimate()
+        self._forget_solution()
+        self.rebuilds += 1
+
+    def _forget_solution(self) -> None:
+        self._factorised = None
+        self._trajectories.clear()
+
+    def _factorisation(self) -> tuple[SuperLU, dict[int, int]]:
+        """Return the factorised information matrix, and the first column of every variable."""
+        if self._factorised is None:
+            self.update()
+            linear = self._isam.getFactorsUnsafe().linearize(self._values)
+            rows, columns, entries = linear.sparseJacobian_()
+            keys = sorted(self._values.keys())
+            sizes = [self._values.atVector(key).size for key in keys]
+            first = dict(zip(keys, itertools.accumulate([0, *sizes[:-1]]), strict=True))
+            size = sum(sizes)
+            jacobian = sparse.csr_matrix(
+                (entries, (rows.astype(int) - 1, columns.astype(int) - 1)),
+                shape=(int(rows.max()), size + 1),
+            )[:, :size]
+            try:
+                solver = splu((jacobian.T @ jacobian).tocsc())
+            except RuntimeError as error:
+                raise EstimationError("the information matrix is singular") from error
+            self._factorised = solver, first
+        return self._factorised
+
+
+def _new_isam() -> gtsam.ISAM2:
+    parameters = gtsam.ISAM2Params()
+    parameters.setFactorization("QR")  # Cholesky calls a long dead-reckoned chain indeterminate
+    parameters.setRelinearizeThreshold(0.02)
+    parameters.relinearizeSkip = 1
+    parameters.findUnusedFactorSlots = True  # memory stays with what is active
+    return gtsam.ISAM2(parameters)
+
+
+def _factor(record: Record, robust_kernel: float) -> gtsam.NonlinearFactor:
+    match record:
+        case PriorRecord():
+            noise = gtsam.noiseModel.Diagonal.Sigmas(record.sigmas)
+            return gtsam.PriorFactorVector(record.key, record.mean, noise)
+        case OdometryRecord():
+            return _odometry(record)
+        case ClosureRecord():
+            return _closure(record, _robust(record.covariance_m2, robust_kernel))
+        case RangeRecord():
+            return _range(record, _robust(np.array([[record.sigma_m**2]]), robust_kernel))
+        case AbsoluteRecord():
+            return _absolute(record, _robust(record.covariance_m2, robust_kernel))
+
+
+def _robust(covariance: Array, robust_kernel: float) -> gtsam.noiseModel.Base:
+    return gtsam.noiseModel.Robust.Create(
+        gtsam.noiseModel.mEstimator.DCS.Create(robust_kernel),
+        gtsam.noiseModel.Gaussian.Covariance(covariance),
+    )
+
+
+def _odometry(record: OdometryRecord) -> gtsam.NonlinearFactor:
+    """Return the linear factor of OdometryRecord, stated at the origin of the state space."""
+    from_origin = -np.eye(4)
+    from_origin[:2, 2:] = record.interval_s * np.eye(2)
+    from_parameters = np.zeros((4, 2))
+    from_parameters[:2, 0] = _QUARTER_TURN @ record.moved_m
+    from_parameters[:2, 1] = record.moved_m
+    right = np.concatenate([record.moved_m, np.zeros(2)])
+    sigmas = np.repeat([record.position_sigma_m, record.bias_sigma_mps], 2)
+    zero = gtsam.Values()
+    zero.insert(record.origin, np.zeros(4))
+    zero.insert(record.target, np.zeros(4))
+    zero.insert(record.parameters, np.zeros(2))
+    linear = gtsam.JacobianFactor(
+        record.target,
+        np.eye(4),
+        record.origin,
+        from_origin,
+        record.parameters,
+        from_parameters,
+        right,
+        gtsam.noiseModel.Diagonal.Sigmas(sigmas),
+    )
+    return gtsam.LinearContainerFactor(linear, zero)
+
+
+_Jacobians = list[Array] | None
+
+
+def _custom(
+    noise: gtsam.noiseModel.Base, keys: list[int], error: Callable[..., Array]
+) -> gtsam.NonlinearFactor:
+    return gtsam.CustomFactor(noise, keys, error)
+
+
+def _closure(record: ClosureRecord, noise: gtsam.noiseModel.Base) -> gtsam.NonlinearFactor:
+    keys = [record.origin.key, record.target.key]
+
+    def error(_this: object, values: gtsam.Values, jacobians: _Jacobians) -> Array:
+        if jacobians is not None:
+            jacobians[0], jacobians[1] = -_POSITION, _POSITION
+        return record.innovation_m(values.atVector(keys[0])[:2], values.atVector(keys[1])[:2])
+
+    return _custom(noise, keys, error)
+
+
+def _range(record: RangeRecord, noise: gtsam.noiseModel.Base) -> gtsam.NonlinearFactor:
+    keys = [record.origin.key, record.target.key]
+
+    def error(_this: object, values: gtsam.Values, jacobians: _Jacobians) -> Array:
+        miss_m, direction = record.innovation_m(
+            values.atVector(keys[0])[:2], values.atVector(keys[1])[:2]
+        )
+        if jacobians is not None:
+            towards = (direction @ _POSITION)[None, :]
+            jacobians[0], jacobians[1] = -towards, towards
+        return np.array([miss_m])
+
+    return _custom(noise, keys, error)
+
+
+def _absolute(record: AbsoluteRecord, noise: gtsam.noiseModel.Base) -> gtsam.NonlinearFactor:
+    keys = [record.anchor.key]
+
+    def error(_this: object, values: gtsam.Values, jacobians: _Jacobians) -> Array:
+        if jacobians is not None:
+            jacobians[0] = _POSITION
+        position_m = values.atVector(keys[0])[:2] + record.anchor.offset_m
+        return np.asarray(position_m - record.position_m)
+
+    return _custom(noise, keys, error)

@@ -1,0 +1,38 @@
+"""The configuration of a leader: one frozen tree that gathers the settings of its parts."""
+
+from dataclasses import dataclass
+
+from firmware.compression.settings import BinningSettings
+from firmware.leader.closures import ClosureSettings
+from firmware.leader.matching import MatchingSettings
+from firmware.leader.pose_graph import GraphSettings
+from firmware.leader.ranges import RangeSettings
+from firmware.leader.reconstruction import ReconstructionSettings
+from firmware.soundings import SonarSettings
+from firmware.submap_builder import SubmapSettings
+from protocol.reassembly import ReassemblySettings
+from protocol.settings import Settings, setting
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LeaderSettings(Settings):
+    """Everything that a leader may be told."""
+
+    sonar: SonarSettings = setting(SonarSettings, "", "the multibeam sonar")
+    submaps: SubmapSettings = setting(SubmapSettings, "", "what a sub-map is")
+    binning: BinningSettings = setting(BinningSettings, "", "how soundings are thinned")
+    reassembly: ReassemblySettings = setting(ReassemblySettings, "", "fragments to sub-maps")
+    reconstruction: ReconstructionSettings = setting(ReconstructionSettings, "", "frames to grids")
+    matching: MatchingSettings = setting(MatchingSettings, "", "terrain matching")
+    closures: ClosureSettings = setting(ClosureSettings, "", "loop closures")
+    ranges: RangeSettings = setting(RangeSettings, "", "one-way travel times")
+    graph: GraphSettings = setting(GraphSettings, "", "the pose graph")
+    cell_m: float = setting(
+        2.0, "m", "grid of the matching (paper, 6.1)", minimum=0.25, maximum=50.0
+    )
+    atlas_submaps: int = setting(
+        5000, "sub-maps", "a day of two vehicles is 4,320", minimum=4, maximum=100_000
+    )
+    pending_ranges: int = setting(
+        256, "ranges", "held until the sender's track is known: two minutes of four", minimum=16
+    )

@@ -1,0 +1,97 @@
+"""A mission: every vehicle's node, the water between them, and one clock that drives them all."""
+
+import itertools
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from firmware.dead_reckoning import ReckonedState
+from firmware.follower.core import FollowerCore
+from firmware.leader.core import LeaderCore
+from host_tools.mission_settings import MissionSettings
+from host_tools.nodes import FollowerNode, LeaderNode, Node
+from host_tools.simulator.placement import Site
+from host_tools.simulator.vehicle import SimulatedVehicle
+from protocol.acoustics import Delivery, Water
+from protocol.schedule import Slots
+
+_WATER_STREAM = 0x57A7E2  # keeps the water's draws apart from the vehicles'
+Progress = Callable[[float], None]
+
+
+def simulated_vehicles(
+    settings: MissionSettings,
+    site: Site,
+    seed: int,
+    on_soundings: Callable[[np.ndarray], None] | None = None,
+) -> list[SimulatedVehicle]:
+    """Return the leader and the followers of a scenario, with their simulated sensors."""
+    return [
+        SimulatedVehicle(settings.scenario, site.seabed, index, seed, on_soundings)
+        for index in range(settings.scenario.followers + 1)
+    ]
+
+
+def water_between(settings: MissionSettings, vehicles: list[SimulatedVehicle], seed: int) -> Water:
+    """Return the medium; the vehicles' true distances are known to it alone."""
+    rng = np.random.default_rng([seed, _WATER_STREAM])
+    return Water(
+        settings.scenario.water,
+        rng,
+        lambda node, time_s: vehicles[node].true_position(time_s),
+        nodes=range(len(vehicles)),
+    )
+
+
+def local_nodes(
+    settings: MissionSettings, vehicles: list[SimulatedVehicle]
+) -> tuple[LeaderNode, list[FollowerNode]]:
+    """Return every vehicle with its core, in this process."""
+    slots = Slots(settings.slots)
+    leader = LeaderNode(
+        LeaderCore(0, deployed(vehicles[0]), settings=settings.leader, slots=slots),
+        vehicles[0].steps(),
+    )
+    followers = [
+        FollowerNode(
+            FollowerCore(
+                vehicle.index, 0, deployed(vehicle), settings=settings.follower, slots=slots
+            ),
+            vehicle.steps(),
+        )
+        for vehicle in vehicles[1:]
+    ]
+    return leader, followers
+
+
+def deployed(vehicle: SimulatedVehicle) -> ReckonedState:
+    """Return where and how a vehicle was put into the water: the start of its dead reckoning."""
+    north_m, east_m, depth_m = vehicle.true_position(0.0)
+    return ReckonedState(time_s=0.0, north_m=north_m, east_m=east_m, yaw_rad=0.0, depth_m=depth_m)
+
+
+def run(
+    nodes: Mapping[int, Node],
+    water: Water,
+    *,
+    duration_s: float,
+    tick_s: float,
+    record: Callable[[Delivery], None],
+    progress: Progress | None = None,
+) -> None:
+    """Drive all nodes to the end: deliveries in the order of time, then each tick in turn."""
+    for step in itertools.count():
+        now_s = step * tick_s
+        if now_s > duration_s + 1e-9:
+            break
+        for delivery in water.deliveries_until(now_s):
+            record(delivery)
+            if delivery.was_received:
+                node = nodes[delivery.destination]
+                node.hear(delivery.frame, delivery.t_rx_s, delivery.t_delivered_s)
+        for number, node in nodes.items():
+            frame = node.tick(now_s)
+            if frame is not None:
+                water.transmit(number, now_s, frame)
+        if progress is not None:
+            progress(now_s)

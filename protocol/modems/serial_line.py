@@ -36,6 +36,7 @@ class SerialLineModem:
 
     def __init__(self, path: str, baud: int, tap: Tap | None = None) -> None:
         self._path, self._baud, self._tap = path, baud, tap
+        self.bytes_read = 0
         self._reader = LineReader()
         self._queue: deque[bytes] = deque()
         self._written = 0
@@ -140,6 +141,7 @@ class SerialLineModem:
         if not port.in_waiting:  # raises on a port that has gone, where a read would return b""
             return
         data = port.read(READ_BYTES)
+        self.bytes_read += len(data)
         self._report("in", data, now_s)
         self._reader.receive_data(data, now_s)
         while (heard := self._reader.next_frame()) is not None:

@@ -1,0 +1,297 @@
+"""Soundings thinned to cells as they stream in: bounded memory, robust to fliers.
+
+Each occupied cell keeps its first few soundings and, from then on, sums over the soundings near
+their median. Memory depends on the area measured, never on the number of soundings; when the cap
+of cells is reached the cell doubles. Fliers are thrown out against the cell's neighbourhood when
+the result is taken, so a lone wild sounding in an empty cell goes as well.
+"""
+
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware.compression.settings import BinningSettings
+from firmware.geometry import Array
+from firmware.submaps import BinnedSoundings
+
+D = TypeVar("D", bound=np.generic)
+_ROW_STRIDE = 1 << 31  # cells per key row: 2 million km at 1 m
+_CHUNK = 1 << 12  # soundings gathered before they are sorted in: 20 pings, 4 ms
+_SIGMA_PER_MAD = 1.4826
+_SMALLEST_SIGMA_M = 0.02  # a noise-free bottom must not gate its own slope away
+
+
+class SoundingBins:
+    """Builds `BinnedSoundings` from any number of soundings in memory that depends on area only."""
+
+    def __init__(self, settings: BinningSettings | None = None) -> None:
+        self._settings = settings or BinningSettings()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all soundings; keep the settings."""
+        self._cell_m = self._settings.cell_m
+        self._keys: NDArray[np.int64] = np.empty(0, dtype=np.int64)
+        # per cell: sums of d, d^2 (about its reference), n, north, east and time
+        self._sums: Array = np.empty((0, 6))
+        self._reference_m: Array = np.empty(0)
+        self._held: NDArray[np.float32] = np.empty((0, self._settings.reservoir), dtype=np.float32)
+        self._filled: NDArray[np.int64] = np.empty(0, dtype=np.int64)
+        self._waiting = np.empty((_CHUNK, 4))
+        self._waiting_count = 0
+        self._sigma_m = np.inf  # gate of the sums, known once reservoirs fill
+        self.dropped_bad = 0
+        self.dropped_fliers = 0
+        self.coarsened = 0
+        self.soundings = 0
+
+    def add(self, soundings_ned_m: Array, time_s: Array | float) -> None:
+        """Take soundings (N, 3) as north, east, depth, measured at time_s (N,) or one time."""
+        soundings_ned_m = np.asarray(soundings_ned_m, dtype=np.float64).reshape(-1, 3)
+        times_s = np.broadcast_to(np.asarray(time_s, dtype=np.float64), len(soundings_ned_m))
+        start = 0
+        while start < len(soundings_ned_m):
+            first = self._waiting_count
+            taken = min(_CHUNK - first, len(soundings_ned_m) - start)
+            self._waiting[first : first + taken, :3] = soundings_ned_m[start : start + taken]
+            self._waiting[first : first + taken, 3] = times_s[start : start + taken]
+            self._waiting_count += taken
+            start += taken
+            if self._waiting_count == _CHUNK:
+                self._sort_in()
+
+    def _sort_in(self) -> None:
+        waiting, self._waiting_count = self._waiting[: self._waiting_count], 0
+        self._add_chunk(waiting[:, :3], waiting[:, 3])
+
+    def _add_chunk(self, soundings_ned_m: Array, times_s: Array) -> None:
+        limit_m = self._cell_m * (_ROW_STRIDE // 4)
+        good = np.all(np.isfinite(soundings_ned_m), axis=1) & np.isfinite(times_s)
+        good &= np.all(np.abs(soundings_ned_m) < limit_m, axis=1)
+        self.dropped_bad += int(good.size - np.count_nonzero(good))
+        soundings_ned_m, times_s = soundings_ned_m[good], times_s[good]
+        if not len(soundings_ned_m):
+            return
+        self.soundings += len(soundings_ned_m)
+        keys = _keys_of(soundings_ned_m[:, :2], self._cell_m)
+        order = np.argsort(keys, kind="stable")
+        keys, soundings_ned_m, times_s = keys[order], soundings_ned_m[order], times_s[order]
+        self._make_room(np.unique(keys))
+        while self._keys.size > self._settings.max_cells:
+            self._coarsen()
+            keys = _halved(keys)
+            order = np.argsort(keys, kind="stable")
+            keys, soundings_ned_m, times_s = keys[order], soundings_ned_m[order], times_s[order]
+        self._accumulate(np.searchsorted(self._keys, keys), soundings_ned_m, times_s)
+
+    def _make_room(self, new: NDArray[np.int64]) -> None:
+        merged = np.union1d(self._keys, new)
+        if merged.size == self._keys.size:
+            return
+        old = np.searchsorted(merged, self._keys)
+        self._sums = _scattered(self._sums, old, merged.size, 0.0)
+        self._reference_m = _scattered(self._reference_m, old, merged.size, np.nan)
+        self._held = _scattered(self._held, old, merged.size, np.nan)
+        self._filled = _scattered(self._filled, old, merged.size, 0)
+        self._keys = merged
+
+    def _accumulate(self, rows: NDArray[np.intp], soundings_ned_m: Array, times_s: Array) -> None:
+        """Add sorted soundings to their cells: into the reservoir while it fills, then the sums."""
+        depth_m = soundings_ned_m[:, 2]
+        rank = _rank(rows)
+        new = (rank == 0) & np.isnan(self._reference_m[rows])
+        self._reference_m[rows[new]] = depth_m[new]
+        offset_m = depth_m - self._reference_m[rows]
+        slot = self._filled[rows] + rank
+        held = slot < self._settings.reservoir
+        self._held[rows[held], slot[held]] = offset_m[held]
+        np.maximum.at(self._filled, rows[held], slot[held] + 1)
+        near = np.ones(rows.size, dtype=bool)
+        late = ~held
+        if late.any():
+            if not np.isfinite(self._sigma_m):
+                self._sigma_m = self._noise_m()
+            centre_m = _median(self._held[rows[late]])
+            gate_m = 2.0 * self._settings.flier_gate * self._sigma_m
+            near[late] = np.abs(offset_m[late] - centre_m) <= gate_m
+            self.dropped_fliers += int(np.count_nonzero(~near))
+        late &= near
+        if late.any():
+            columns = (
+                offset_m[late],
+                offset_m[late] ** 2,
+                np.ones(np.count_nonzero(late)),
+                soundings_ned_m[late, 0],
+                soundings_ned_m[late, 1],
+                times_s[late],
+            )
+            for column, values in enumerate(columns):
+                self._sums[:, column] += np.bincount(rows[late], values, self._keys.size)
+        if held.any():  # positions and times of held soundings join the sums; depths come later
+            for column, values in (
+                (3, soundings_ned_m[held, 0]),
+                (4, soundings_ned_m[held, 1]),
+                (5, times_s[held]),
+            ):
+                self._sums[:, column] += np.bincount(rows[held], values, self._keys.size)
+
+    def _noise_m(self) -> float:
+        """Return the robust spread of soundings about the median of their cell."""
+        several = self._filled >= 3
+        if not several.any():
+            return 1.0
+        held = self._held[several]
+        with np.errstate(invalid="ignore"):
+            spread = np.abs(held - _median(held)[:, None])
+        sigma_m = _SIGMA_PER_MAD * float(np.median(spread[spread > 0])) if spread.any() else 0.0
+        return max(sigma_m if np.isfinite(sigma_m) else 0.0, _SMALLEST_SIGMA_M)
+
+    def _coarsen(self) -> None:
+        """Double the cell; each new cell keeps the soundings first held by its parts."""
+        self.coarsened += 1
+        self._cell_m *= 2.0
+        keys = _halved(self._keys)
+        order = np.argsort(keys, kind="stable")
+        new, first, inverse = np.unique(keys[order], return_index=True, return_inverse=True)
+        reference_m = self._reference_m[order][first]
+        shift_m = self._reference_m[order] - reference_m[inverse]
+        sums = self._sums[order]
+        count = sums[:, 2]
+        sums[:, 1] += 2.0 * shift_m * sums[:, 0] + count * shift_m**2
+        sums[:, 0] += count * shift_m
+        self._sums = np.add.reduceat(sums, first, axis=0)
+        offsets_m = (self._held[order] + shift_m[:, None]).ravel()
+        rows = np.repeat(inverse, self._held.shape[1])
+        rows, offsets_m = rows[np.isfinite(offsets_m)], offsets_m[np.isfinite(offsets_m)]
+        rank = _rank(rows)
+        kept = rank < self._held.shape[1]
+        self._held = np.full((new.size, self._held.shape[1]), np.nan, dtype=np.float32)
+        self._held[rows[kept], rank[kept]] = offsets_m[kept]
+        self._filled = np.bincount(rows[kept], minlength=new.size)
+        rows, offsets_m = rows[~kept], offsets_m[~kept]
+        for column, values in enumerate((offsets_m, offsets_m**2, np.ones_like(offsets_m))):
+            self._sums[:, column] += np.bincount(rows, values, new.size)
+        self._keys, self._reference_m = new, reference_m
+
+    def result(self) -> BinnedSoundings:
+        """Return the mean of each cell without fliers; cells of fliers alone are left out."""
+        self._sort_in()
+        if not self._keys.size:
+            empty = np.empty(0)
+            return BinnedSoundings(
+                cell_m=self._cell_m,
+                north_m=empty,
+                east_m=empty,
+                depth_m=empty,
+                variance_m2=empty,
+                count=empty,
+                time_s=empty,
+            )
+        sigma_m = self._noise_m()
+        held_m = self._held + self._reference_m[:, None]
+        centre_m, spread_m = self._neighbourhood(held_m, sigma_m)
+        gate_m = self._settings.flier_gate * np.hypot(spread_m, sigma_m)
+        with np.errstate(invalid="ignore"):
+            near = np.abs(held_m - centre_m[:, None]) <= gate_m[:, None]
+        self.dropped_fliers += int(np.count_nonzero(np.isfinite(held_m) & ~near))
+        sums_near = (
+            np.abs(
+                self._reference_m + self._sums[:, 0] / np.maximum(self._sums[:, 2], 1.0) - centre_m
+            )
+            <= gate_m
+        )
+        offset = np.where(near, self._held.astype(np.float64), 0.0)
+        n_sums = np.where(sums_near, self._sums[:, 2], 0.0)
+        count: Array = near.sum(axis=1).astype(np.float64) + n_sums
+        total = offset.sum(axis=1) + np.where(sums_near, self._sums[:, 0], 0.0)
+        squares = (offset**2).sum(axis=1) + np.where(sums_near, self._sums[:, 1], 0.0)
+        kept = count > 0
+        count = np.maximum(count, 1.0)
+        mean = total / count
+        within = np.maximum(squares - count * mean**2, 0.0)
+        variance = (within + 4.0 * sigma_m**2) / (count + 3.0) / count
+        placed = self._filled + self._sums[:, 2]
+        return BinnedSoundings(
+            cell_m=self._cell_m,
+            north_m=(self._sums[:, 3] / placed)[kept],
+            east_m=(self._sums[:, 4] / placed)[kept],
+            depth_m=(mean + self._reference_m)[kept],
+            variance_m2=variance[kept],
+            count=count[kept],
+            time_s=(self._sums[:, 5] / placed)[kept],
+        )
+
+    def _neighbourhood(self, held_m: Array, sigma_m: float) -> tuple[Array, Array]:
+        """Return the median and robust spread of the cell medians in the 5 x 5 cells around."""
+        with np.errstate(invalid="ignore"):
+            median_m = _median(held_m)
+        around = np.full((self._keys.size, 25), np.nan)
+        for step in range(5):
+            lowest = self._keys + (step - 2) * _ROW_STRIDE - 2
+            at = np.searchsorted(self._keys, lowest)
+            for ahead in range(5):
+                row = np.minimum(at + ahead, self._keys.size - 1)
+                inside = (at + ahead < self._keys.size) & (self._keys[row] <= lowest + 4)
+                around[inside, 5 * step + ahead] = median_m[row[inside]]
+        centre_m = _median(around)
+        spread_m = _SIGMA_PER_MAD * _median(np.abs(around - centre_m[:, None]))
+        few = np.isfinite(around).sum(axis=1) < 4
+        spread_m[few] = np.maximum(spread_m[few], 2.0 * sigma_m)
+        return centre_m, spread_m
+
+
+def coarsened(bins: BinnedSoundings, cell_m: float) -> BinnedSoundings:
+    """Return the bins gathered into cells of about cell_m; unchanged if they are as coarse."""
+    if bins.cell_m >= 0.75 * cell_m or not bins.north_m.size:
+        return bins
+    keys = _keys_of(np.column_stack([bins.north_m, bins.east_m]), cell_m)
+    _, inverse = np.unique(keys, return_inverse=True)
+    count = np.bincount(inverse, bins.count).astype(np.float64)
+
+    def mean(values: Array) -> Array:
+        return np.bincount(inverse, bins.count * values) / count
+
+    depth_m = mean(bins.depth_m)
+    noise = np.bincount(inverse, bins.count**2 * bins.variance_m2) / count**2
+    return BinnedSoundings(
+        cell_m=cell_m,
+        north_m=mean(bins.north_m),
+        east_m=mean(bins.east_m),
+        depth_m=depth_m,
+        variance_m2=noise,
+        count=count,
+        time_s=mean(bins.time_s),
+    )
+
+
+def _keys_of(position_m: Array, cell_m: float) -> NDArray[np.int64]:
+    index = np.floor(position_m / cell_m).astype(np.int64) + _ROW_STRIDE // 2
+    return index[:, 0] * _ROW_STRIDE + index[:, 1]
+
+
+def _halved(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    half = _ROW_STRIDE // 2
+    rows, columns = keys // _ROW_STRIDE - half, keys % _ROW_STRIDE - half
+    return (rows // 2 + half) * _ROW_STRIDE + columns // 2 + half
+
+
+def _rank(rows: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return 0, 1, 2 ... within each run of equal values."""
+    first = np.flatnonzero(np.r_[True, rows[1:] != rows[:-1]]) if rows.size else rows
+    return np.arange(rows.size) - np.repeat(first, np.diff(np.r_[first, rows.size]))
+
+
+def _median(values: NDArray[D]) -> Array:
+    """Return the median of each row without its NaN; every row holds a number."""
+    ordered = np.sort(values, axis=1)  # NaN last
+    count = np.isfinite(ordered).sum(axis=1)
+    row = np.arange(len(ordered))
+    middle: Array = 0.5 * (ordered[row, (count - 1) // 2] + ordered[row, count // 2])
+    return middle
+
+
+def _scattered(values: NDArray[D], where: NDArray[np.intp], size: int, fill: float) -> NDArray[D]:
+    out = np.full((size, *values.shape[1:]), fill, dtype=values.dtype)
+    out[where] = values
+    return out

@@ -1,0 +1,63 @@
+"""c and sigma^2 such that the leader's variance (Eq. 6) is that of soundings about its map."""
+
+import numpy as np
+
+from firmware.compression.decoder import point_decoder
+from firmware.compression.kernels import Hyperparameters
+from firmware.geometry import Array
+from firmware.submaps import BinnedSoundings
+
+_ROWS = 4096  # residuals looked at: a hundred would do for two numbers, these cost 4 ms
+_SMALLEST_M2 = 1e-6
+
+
+def calibrated(
+    points_ned_m: Array, hyper: Hyperparameters, bins: BinnedSoundings
+) -> tuple[Hyperparameters, float]:
+    """Return hyperparameters with c and sigma^2 refitted, and the map's RMSE on the bins in m.
+
+    A sounding in a cell deviates from the map by the cell's spread and by the map's error there:
+    E[e^2] = c v + sigma^2, with v the posterior variance for c = 1. Both are found by weighted
+    least squares, weights 1 / E^2, neither below zero.
+    """
+    every = max(1, -(-bins.depth_m.size // _ROWS))
+    unit = Hyperparameters(
+        b_per_m=hyper.b_per_m,
+        c_m2=1.0,
+        sigma2_m2=0.0,
+        mean_depth_m=hyper.mean_depth_m,
+        kernel=hyper.kernel,
+    )
+    decoder = point_decoder(points_ned_m, unit)
+    position_m = np.column_stack([bins.north_m, bins.east_m])[::every]
+    depth_m, posterior = decoder.predict(position_m)
+    count = bins.count[::every]
+    spread = bins.variance_m2[::every] * np.maximum(count - 1.0, 0.0)
+    residual_m = bins.depth_m[::every] - depth_m
+    squared = spread + residual_m**2
+    c, sigma2 = _fitted(posterior, squared, count)
+    calibrated_hyper = Hyperparameters(
+        b_per_m=hyper.b_per_m,
+        c_m2=c,
+        sigma2_m2=sigma2,
+        mean_depth_m=hyper.mean_depth_m,
+        kernel=hyper.kernel,
+        noise_applied=hyper.noise_applied,
+    )
+    return calibrated_hyper, float(np.sqrt(np.mean(residual_m**2)))
+
+
+def _fitted(posterior: Array, squared: Array, count: Array) -> tuple[float, float]:
+    mean = max(float(np.average(squared, weights=count)), _SMALLEST_M2)
+    c, sigma2 = mean, mean
+    for _ in range(4):
+        weight = count / (c * posterior + sigma2) ** 2
+        design = np.column_stack([posterior, np.ones_like(posterior)])
+        normal = design.T @ (design * weight[:, None])
+        right = design.T @ (squared * weight)
+        c, sigma2 = np.linalg.solve(normal + 1e-12 * np.trace(normal) * np.eye(2), right)
+        if c <= 0.0:
+            c, sigma2 = _SMALLEST_M2, mean
+        elif sigma2 <= 0.0:
+            c, sigma2 = right[0] / max(normal[0, 0], 1e-300), _SMALLEST_M2
+    return max(float(c), _SMALLEST_M2), max(float(sigma2), _SMALLEST_M2)

@@ -1,0 +1,261 @@
+"""The error the leader must expect, averaged over the frames that may be lost, with its gradient.
+
+With all points the leader's map is f = K_N beta, beta = Q h, Q = (K + nugget I)^-1. When the points
+B are lost, its weights become, exactly,
+
+    beta_B = beta - Q[:, B] Q[B, B]^-1 beta[B],
+
+so the error under every pattern of losses is a quadratic form of beta in the Gram matrices
+G = K_N' W K_N and g = K_N' W y, which are formed once. The best beta therefore solves one M x M
+system, and by the envelope theorem the gradient in positions and length scale needs only partial
+derivatives: no sampling, and two passes over the soundings whatever the number of patterns.
+"""
+
+import dataclasses
+from collections.abc import Generator
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve, solve_triangular
+
+from firmware.compression.decoder import NUGGET, factorised
+from firmware.compression.kernels import Kernel, correlation_and_slope, squared_distance
+from firmware.compression.losses import LossPatterns
+from firmware.geometry import Array
+
+_ROWS = 1024  # kernel rows per step: keeps a step under 10 ms
+
+Float32 = NDArray[np.float32]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evaluation:
+    """The expected mean square error in m^2, its gradient, and the weights that reach it."""
+
+    error_m2: float
+    by_position: Array  # (M, 2) m^2 per m
+    by_log_b: float
+    depth_m: Array  # (M,), what is sent: (K + nugget I) beta
+
+
+class ExpectedError:
+    """The objective for one sub-map: positions (M, 2) and log b in, `Evaluation` out."""
+
+    def __init__(
+        self,
+        position_m: Array,
+        depth_m: Array,
+        weight: Array,
+        kernel: Kernel,
+        patterns: LossPatterns,
+        fragment: NDArray[np.intp],
+        ridge: float,
+    ) -> None:
+        self._position_m = position_m.astype(np.float32)
+        self._depth_m = depth_m.astype(np.float32)
+        self._weight = (weight / weight.sum()).astype(np.float32)
+        self._total_m2 = float(np.dot(self._weight, depth_m**2))
+        self._kernel = kernel
+        self._no_loss = patterns.no_loss
+        self._groups = _groups(patterns, fragment)
+        self._ridge = ridge
+        self.failed_factorisations = 0
+        self.evaluations = 0
+
+    def evaluate(self, point_m: Array, log_b: float) -> Evaluation:
+        """Return the evaluation at once."""
+        return run(self.steps(point_m, log_b))
+
+    def steps(
+        self, point_m: Array, log_b: float, gradient: bool = True
+    ) -> Generator[None, None, Evaluation]:
+        """Evaluate in small steps; the generator's value is the `Evaluation`.
+
+        Raises
+        ------
+        EstimationError
+            When the points' covariance cannot be factorised.
+        """
+        self.evaluations += 1
+        b = float(np.exp(log_b))
+        points = point_m.astype(np.float32)
+        rows: list[_Rows] = []
+        gram, moment = np.zeros((len(points), len(points))), np.zeros(len(points))
+        for start in range(0, len(self._depth_m), _ROWS):
+            part = slice(start, start + _ROWS)
+            squared = squared_distance(self._position_m[part], points, b)
+            k, slope = correlation_and_slope(self._kernel, squared)
+            exact = k.astype(np.float64)  # float32 sums lose the small differences beta lives on
+            weighted = exact * self._weight[part, None]
+            gram += weighted.T @ exact
+            moment += weighted.T @ self._depth_m[part]
+            if gradient:
+                rows.append(_Rows(part=part, k=k, slope=slope))
+            yield
+        inner = self._solved(point_m, b, gram, moment)
+        if not gradient:
+            return inner.evaluation
+        yield
+        by_position, by_log_b = inner.evaluation.by_position, inner.evaluation.by_log_b
+        stack = inner.stack.astype(np.float32)
+        low_rank = (2.0 * inner.stack * inner.probability).astype(np.float32).T
+        for row in rows:
+            misfit = row.k @ stack
+            misfit -= self._depth_m[row.part, None]
+            misfit *= self._weight[row.part, None]
+            pull = misfit @ low_rank
+            pull *= row.slope
+            here = self._position_m[row.part]
+            by_position += (b * b) * (pull.T @ here - pull.sum(axis=0)[:, None] * points)
+            by_log_b -= float(np.vdot(pull, squared_distance(here, points, b)))
+            yield
+        return dataclasses.replace(inner.evaluation, by_position=by_position, by_log_b=by_log_b)
+
+    def _solved(self, point_m: Array, b: float, gram: Array, moment: Array) -> "_Inner":
+        """Return the best weights, their error, and the gradient through the points' own K."""
+        squared = squared_distance(point_m, point_m, b)
+        k, slope = correlation_and_slope(self._kernel, squared)
+        lower, nugget, failed = factorised(np.array(k), NUGGET)
+        self.failed_factorisations += failed
+        k = k + nugget * np.eye(len(point_m))
+        inverse = cho_solve((lower, True), np.eye(len(point_m)))
+        blocks = [_Block.of(group, inverse) for group in self._groups]
+        beta = self._best_weights(gram, moment, inverse, lower, blocks)
+        probability = np.concatenate([[self._no_loss], *(block.probability for block in blocks)])
+        lost = [np.zeros((len(beta), 1)), *(block.weights_lost(beta) for block in blocks)]
+        correction = inverse @ np.hstack(lost)
+        stack = beta[:, None] - correction
+        fitted = gram @ stack
+        error = self._total_m2 + self._ridge * float(beta @ k @ beta)
+        error += float(probability @ (np.einsum("mp,mp->p", stack, fitted) - 2.0 * moment @ stack))
+        # the points' own K enters through Q, that is through the corrections
+        pull = 2.0 * probability * (fitted - moment[:, None])
+        spread = inverse @ pull
+        first = 1
+        for block in blocks:
+            columns = slice(first, first + len(block.probability))
+            pull[:, columns] -= block.padded(block.solved(spread[:, columns]))
+            first += len(block.probability)
+        by_k = (inverse @ pull) @ correction.T + self._ridge * np.outer(beta, beta)
+        by_k = (by_k + by_k.T) * slope
+        evaluation = Evaluation(
+            error_m2=error,
+            by_position=(b * b) * (by_k @ point_m - by_k.sum(axis=1)[:, None] * point_m),
+            by_log_b=-0.5 * float(np.sum(by_k * squared)),
+            depth_m=k @ beta,
+        )
+        return _Inner(evaluation=evaluation, stack=stack, probability=probability)
+
+    def _best_weights(
+        self, gram: Array, moment: Array, inverse: Array, lower: Array, blocks: "list[_Block]"
+    ) -> Array:
+        """Return the beta of least expected error: one positive definite system, whitened."""
+        size = len(moment)
+        lost = np.zeros((size, size))
+        mapped = gram @ inverse
+        twice = inverse @ mapped
+        quadratic = gram.copy()
+        for block in blocks:
+            lost += block.scattered(block.inverse, size)
+            inner = block.gathered(twice)
+            quadratic += block.scattered(block.inverse @ inner @ block.inverse, size)
+        cross = mapped @ lost
+        quadratic -= cross + cross.T
+        right = moment - lost @ (inverse @ moment)
+        white = solve_triangular(lower, quadratic, lower=True)
+        white = solve_triangular(lower, white.T, lower=True)
+        factor, _, failed = factorised(0.5 * (white + white.T), self._ridge)
+        self.failed_factorisations += failed
+        alpha = cho_solve((factor, True), solve_triangular(lower, right, lower=True))
+        beta: Array = solve_triangular(lower, alpha, lower=True, trans=1)
+        return beta
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Rows:
+    """Kernel rows kept between the two passes over the cells."""
+
+    part: slice
+    k: Float32
+    slope: Float32
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Inner:
+    """What is known between the passes: weights under each pattern (M, P), and the rest."""
+
+    evaluation: Evaluation
+    stack: Array
+    probability: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Block:
+    """Patterns that lose equally many points: indices (G, m) and the inverses of Q there."""
+
+    index: NDArray[np.intp]
+    probability: Array  # (G,)
+    inverse: Array  # (G, m, m)
+    size: int
+
+    @classmethod
+    def of(cls, group: tuple[NDArray[np.intp], Array], inverse: Array) -> "_Block":
+        index, probability = group
+        inner = np.asarray(
+            np.linalg.inv(inverse[index[:, :, None], index[:, None, :]]), dtype=np.float64
+        )
+        return cls(index=index, probability=probability, inverse=inner, size=len(inverse))
+
+    def gathered(self, matrix: Array) -> Array:
+        out: Array = matrix[self.index[:, :, None], self.index[:, None, :]]
+        return out
+
+    def scattered(self, blocks: Array, size: int) -> Array:
+        """Return the probability-weighted sum of blocks (G, m, m) put where they belong."""
+        flat = self.index[:, :, None] * size + self.index[:, None, :]
+        values = blocks * self.probability[:, None, None]
+        out = np.bincount(flat.ravel(), values.ravel(), size * size).astype(np.float64)
+        return out.reshape(size, size)
+
+    def solved(self, columns: Array) -> Array:
+        """Return inverse times the lost rows of each pattern's column (M, G), as (G, m)."""
+        rows = columns[self.index, np.arange(len(self.index))[:, None]]
+        return np.asarray(np.einsum("gij,gj->gi", self.inverse, rows))
+
+    def padded(self, values: Array) -> Array:
+        """Return values (G, m) as columns (M, G) that are zero where nothing was lost."""
+        out = np.zeros((self.size, len(self.index)))
+        out[self.index, np.arange(len(self.index))[:, None]] = values
+        return out
+
+    def weights_lost(self, beta: Array) -> Array:
+        return self.padded(np.einsum("gij,gj->gi", self.inverse, beta[self.index]))
+
+
+def _groups(
+    patterns: LossPatterns, fragment: NDArray[np.intp]
+) -> list[tuple[NDArray[np.intp], Array]]:
+    """Return indices (G, m) and probabilities (G,) of the patterns of each number lost."""
+    by_size: dict[int, list[tuple[NDArray[np.intp], float]]] = {}
+    for points, probability in zip(
+        patterns.lost_points(fragment), patterns.probability, strict=True
+    ):
+        by_size.setdefault(len(points), []).append((points, float(probability)))
+    return [
+        (np.array([points for points, _ in group]), np.array([p for _, p in group]))
+        for size, group in sorted(by_size.items())
+        if size
+    ]
+
+
+def run(steps: Generator[None, None, T]) -> T:
+    """Return the value of a generator of steps, taken all at once."""
+    while True:
+        try:
+            next(steps)
+        except StopIteration as stop:
+            value: T = stop.value
+            return value

@@ -1,0 +1,160 @@
+"""The fit of pseudo points through the leader's own decoder, for the losses to expect."""
+
+from collections.abc import Generator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware.compression.expected import Evaluation, ExpectedError
+from firmware.compression.initial import dealt_fragments, initial_points
+from firmware.compression.kernels import Kernel
+from firmware.compression.lbfgs import Improvement, Trial, minimise_steps
+from firmware.compression.losses import LossPatterns, loss_patterns
+from firmware.compression.settings import CompressionSettings
+from firmware.geometry import Array
+from firmware.submaps import BinnedSoundings
+
+_START_SCALES = (0.6, 1.2)  # length scales tried at first, in spacings of the points
+_TRIAL_ROWS = 1024  # rows that choose the kernel: a third, for a third of the time
+_SHORTEST, _LONGEST = 0.2, 30.0  # length scale in spacings: between no and full correlation
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FittedPoints:
+    """A state of the fit: positions (M, 2) and depths (M,) about the frame, and their kernel."""
+
+    position_m: Array
+    depth_m: Array
+    fragment: NDArray[np.intp]
+    b_per_m: float
+    kernel: Kernel
+    error_m2: float
+    evaluations: int
+    failed_factorisations: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FitFrame:
+    """The cells to be fitted, centred: position (K, 2), depth (K,), weight (K,)."""
+
+    position_m: Array
+    depth_m: Array
+    weight: Array
+    origin_m: Array
+    mean_depth_m: float
+    ridge: float
+
+
+def fit_frame(bins: BinnedSoundings, max_rows: int) -> FitFrame:
+    """Return the cells about their centre, weighted by how well each is known.
+
+    The ridge is the noise of a cell over the variance of depth, as in the regression of Eq. 5.
+    """
+    position_m = np.column_stack([bins.north_m, bins.east_m])
+    every = max(1, -(-len(position_m) // max_rows))
+    position_m, depth_m = position_m[::every], bins.depth_m[::every]
+    variance_m2 = np.maximum(bins.variance_m2[::every], 1e-6)
+    origin_m = np.median(position_m, axis=0)
+    mean_depth_m = float(np.float32(depth_m.mean()))
+    typical = float(np.median(variance_m2))
+    spread = max(float(depth_m.var()), 1e-6)
+    return FitFrame(
+        position_m=position_m - origin_m,
+        depth_m=depth_m - mean_depth_m,
+        weight=2.0 / (1.0 + np.minimum(variance_m2 / typical, 20.0)),
+        origin_m=origin_m,
+        mean_depth_m=mean_depth_m,
+        ridge=min(typical / spread, 1.0) / len(depth_m),
+    )
+
+
+def fit_steps(
+    frame: FitFrame, count: int, fragments: int, settings: CompressionSettings
+) -> Generator[FittedPoints | None, None, str]:
+    """Yield ever better fits, and None between small steps; the value says why it ended."""
+    start_m, held = initial_points(frame.position_m, frame.depth_m, count)
+    yield None
+    spacing_m = _spacing_m(start_m)
+    fragment = dealt_fragments(start_m, fragments)
+    patterns = loss_patterns(settings.expected_loss, fragments)
+    yield None
+    kernel, log_b = yield from _choose(frame, start_m, fragment, patterns, spacing_m, settings)
+    problem = ExpectedError(
+        frame.position_m, frame.depth_m, frame.weight, kernel, patterns, fragment, frame.ridge
+    )
+    lowest, highest = np.log(1.0 / (_LONGEST * spacing_m)), np.log(1.0 / (_SHORTEST * spacing_m))
+
+    def unpacked(x: Array) -> tuple[Array, float]:
+        point_m = start_m.copy()
+        point_m[held:] += spacing_m * x[:-1].reshape(-1, 2)
+        return point_m, float(np.clip(x[-1], lowest, highest))
+
+    def objective(x: Array) -> Generator[None, None, Trial[tuple[Array, float, Evaluation]]]:
+        point_m, log_b = unpacked(x)
+        result = yield from problem.steps(point_m, log_b)
+        by_x = np.append(spacing_m * result.by_position[held:].ravel(), result.by_log_b)
+        if not lowest < x[-1] < highest:
+            by_x[-1] = 0.0
+        return Trial(value=result.error_m2, gradient=by_x, payload=(point_m, log_b, result))
+
+    def fitted(step: Improvement[tuple[Array, float, Evaluation]]) -> FittedPoints:
+        point_m, log_b, result = step.payload
+        return FittedPoints(
+            position_m=point_m,
+            depth_m=result.depth_m,
+            fragment=fragment,
+            b_per_m=float(np.exp(log_b)),
+            kernel=kernel,
+            error_m2=step.value,
+            evaluations=step.evaluations,
+            failed_factorisations=problem.failed_factorisations,
+        )
+
+    x0 = np.append(np.zeros(2 * (len(start_m) - held)), log_b)
+    steps = minimise_steps(
+        objective, x0, evaluations=max(settings.iterations, 1), first_move=0.1, largest_move=0.5
+    )
+    while True:
+        try:
+            step = next(steps)
+        except StopIteration as stop:
+            return str(stop.value)
+        yield None if step is None else fitted(step)
+
+
+def _choose(
+    frame: FitFrame,
+    point_m: Array,
+    fragment: NDArray[np.intp],
+    patterns: LossPatterns,
+    spacing_m: float,
+    settings: CompressionSettings,
+) -> Generator[None, None, tuple[Kernel, float]]:
+    """Return the kernel and log b of least expected error at the first points."""
+    kernels = list(Kernel) if settings.kernel == "auto" else [Kernel[settings.kernel.upper()]]
+    every = max(1, len(frame.depth_m) // _TRIAL_ROWS)
+    best: tuple[float, Kernel, float] = (np.inf, kernels[0], -np.log(spacing_m))
+    for kernel in kernels:
+        problem = ExpectedError(
+            frame.position_m[::every],
+            frame.depth_m[::every],
+            frame.weight[::every],
+            kernel,
+            patterns,
+            fragment,
+            frame.ridge * every,
+        )
+        for scale in _START_SCALES:
+            log_b = -np.log(scale * _UNIT_SCALE[kernel] * spacing_m)
+            result = yield from problem.steps(point_m, log_b, gradient=False)
+            best = min(best, (result.error_m2, kernel, log_b))
+    return best[1], best[2]
+
+
+_UNIT_SCALE = {Kernel.SQUARED_EXPONENTIAL: 1.0, Kernel.MATERN32: 2.0, Kernel.EXPONENTIAL: 4.0}
+
+
+def _spacing_m(point_m: Array) -> float:
+    span_m = np.maximum(np.ptp(point_m, axis=0), 1e-3)
+    return max(float(np.sqrt(span_m[0] * span_m[1] / len(point_m))), 0.05)

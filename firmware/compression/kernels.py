@@ -1,0 +1,105 @@
+"""Covariance functions of the sub-map's Gaussian process, and how a packet names them.
+
+All take the scaled distance s = b d and return the correlation (c = 1). Equation (3) of the paper
+can be read with the norm (`EXPONENTIAL`, as printed) or its square (`SQUARED_EXPONENTIAL`).
+"""
+
+import enum
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware.geometry import Array
+
+FloatArray = NDArray[Any]  # float32 for rows over soundings, float64 among points
+_EXPONENT_FLOOR = -30.0  # below it float32 gets denormal, and denormals are 20-60 times slower
+
+
+class Kernel(enum.IntEnum):
+    """The covariance functions that the hyperparameters can name."""
+
+    SQUARED_EXPONENTIAL = 0  # exp(-s^2 / 2)
+    MATERN32 = 1  # (1 + sqrt3 s) exp(-sqrt3 s)
+    EXPONENTIAL = 2  # exp(-s / 2)
+
+
+def correlation(kernel: Kernel, squared: FloatArray) -> FloatArray:
+    """Return the correlation at squared scaled distances, in their precision; squared is kept."""
+    return correlation_and_slope(kernel, squared)[0]
+
+
+def correlation_and_slope(kernel: Kernel, squared: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the correlation k and the slope -2 dk/d(s^2), both of the shape of `squared`.
+
+    With s = b d, dk/dz = slope b^2 (x - z) for a point z, and dk/d(log b) = -slope s^2. The slope
+    of the exponential kernel is singular at zero distance and is held there.
+    """
+    if kernel is Kernel.SQUARED_EXPONENTIAL:
+        k = np.exp(np.maximum(-0.5 * squared, _EXPONENT_FLOOR))
+        return k, k
+    s = np.sqrt(squared)
+    if kernel is Kernel.MATERN32:
+        s *= -np.sqrt(3.0).astype(s.dtype)
+        e = np.exp(np.maximum(s, _EXPONENT_FLOOR))
+        return (1.0 - s) * e, 3.0 * e
+    k = np.exp(np.maximum(-0.5 * s, _EXPONENT_FLOOR))
+    return k, 0.5 * k / np.maximum(s, 1e-4)
+
+
+def squared_distance(left_m: FloatArray, right_m: FloatArray, b: float) -> FloatArray:
+    """Return b^2 |x - z|^2 for all pairs of left (N, 2) and right (M, 2), as (N, M)."""
+    squared = np.subtract.outer(left_m[:, 0], right_m[:, 0])
+    squared *= squared
+    east = np.subtract.outer(left_m[:, 1], right_m[:, 1])
+    east *= east
+    squared += east
+    squared *= left_m.dtype.type(b * b)
+    return squared
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Hyperparameters:
+    """What the 16 bytes of a packet say: b, c, sigma^2 and the mean depth, and the kernel.
+
+    The kernel is told by signs: b > 0 and c > 0 the squared exponential, b < 0 Matern-3/2, c < 0
+    the exponential. sigma^2 < 0 asks the leader to apply |sigma^2| as noise (Eq. 5 to the letter);
+    otherwise only the nugget counts, as pseudo points are already free of noise.
+    """
+
+    b_per_m: float
+    c_m2: float
+    sigma2_m2: float
+    mean_depth_m: float
+    kernel: Kernel
+    noise_applied: bool = False
+
+    def to_wire(self) -> NDArray[np.float32]:
+        """Return the four float32 of the packet."""
+        b = -self.b_per_m if self.kernel is Kernel.MATERN32 else self.b_per_m
+        c = -self.c_m2 if self.kernel is Kernel.EXPONENTIAL else self.c_m2
+        sigma2 = -self.sigma2_m2 if self.noise_applied else self.sigma2_m2
+        return np.array([b, c, sigma2, self.mean_depth_m], dtype=np.float32)
+
+    @classmethod
+    def from_wire(cls, values: Array, fallback_depth_m: float) -> "Hyperparameters":
+        """Return what the four numbers say, held within bounds whatever they are."""
+        b, c, sigma2, mean_m = (float(value) for value in np.asarray(values, dtype=np.float64))
+        kernel = Kernel.SQUARED_EXPONENTIAL
+        if c < 0.0:
+            kernel = Kernel.EXPONENTIAL
+        elif b < 0.0:
+            kernel = Kernel.MATERN32
+        return cls(
+            b_per_m=_held(abs(b), 1e-4, 1e2, 0.1),
+            c_m2=_held(abs(c), 1e-8, 1e6, 1.0),
+            sigma2_m2=_held(abs(sigma2), 0.0, 1e6, 0.02),
+            mean_depth_m=mean_m if abs(mean_m) < 2e4 else fallback_depth_m,
+            kernel=kernel,
+            noise_applied=sigma2 < 0.0,
+        )
+
+
+def _held(value: float, lowest: float, highest: float, otherwise: float) -> float:
+    return min(max(value, lowest), highest) if np.isfinite(value) else otherwise

@@ -1,0 +1,107 @@
+"""Limited-memory BFGS whose objective is a generator, so that a fit never holds up a ping."""
+
+from collections import deque
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from firmware.geometry import Array
+
+T = TypeVar("T")
+_PAIRS = 12  # of past steps; more brings nothing within tens of evaluations
+_SUFFICIENT = 1e-4  # Armijo
+_SHORTENINGS = 8  # of one step, then the search has failed
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trial(Generic[T]):
+    """One evaluation: the value, its gradient, and whatever the objective wants remembered."""
+
+    value: float
+    gradient: Array
+    payload: T
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Improvement(Generic[T]):
+    """A lower value than any before, and the evaluations it took so far."""
+
+    value: float
+    payload: T
+    evaluations: int
+
+
+def minimise_steps(
+    objective: Callable[[Array], Generator[None, None, Trial[T]]],
+    start: Array,
+    *,
+    evaluations: int,
+    first_move: float,
+    largest_move: float,
+    tolerance: float = 2e-4,
+) -> Generator[Improvement[T] | None, None, str]:
+    """Yield improvements, and None between small steps; the generator's value says why it ended.
+
+    first_move and largest_move bound the change of any coordinate in the first step and in all.
+    The end is "budget", "converged" (three steps in a row gained less than `tolerance` of the
+    value) or "line search" (no step along the gradient helps: the numbers are exhausted).
+    """
+    current = yield from objective(start)
+    x, used, idle = start, 1, 0
+    yield Improvement(value=current.value, payload=current.payload, evaluations=used)
+    pairs: deque[tuple[Array, Array]] = deque(maxlen=_PAIRS)
+    while used < evaluations:
+        direction = -_times_inverse_hessian(current.gradient, pairs)
+        slope = float(direction @ current.gradient)
+        if slope >= 0.0:
+            pairs.clear()
+            direction, slope = -current.gradient, -float(current.gradient @ current.gradient)
+        reach = float(np.abs(direction).max())
+        if not np.isfinite(reach) or reach == 0.0:
+            return "converged"
+        step = min(1.0, (largest_move if pairs else first_move) / reach)
+        if not pairs:
+            step = first_move / reach
+        for _ in range(_SHORTENINGS):
+            trial = yield from objective(x + step * direction)
+            used += 1
+            if trial.value <= current.value + _SUFFICIENT * step * slope:
+                break
+            if used >= evaluations:
+                return "budget"
+            curve = trial.value - current.value - step * slope
+            shorter = -0.5 * slope * step / curve if np.isfinite(curve) and curve > 0 else 0.25
+            step *= min(max(shorter, 0.1), 0.5)
+        else:
+            if not pairs:
+                return "line search"
+            pairs.clear()
+            continue
+        change, turn = step * direction, trial.gradient - current.gradient
+        if change @ turn > 1e-12 * (turn @ turn):
+            pairs.append((change, turn))
+        gained = current.value - trial.value
+        idle = idle + 1 if gained < tolerance * abs(trial.value) else 0
+        x, current = x + change, trial
+        yield Improvement(value=current.value, payload=current.payload, evaluations=used)
+        if idle >= 3:
+            return "converged"
+    return "budget"
+
+
+def _times_inverse_hessian(gradient: Array, pairs: "deque[tuple[Array, Array]]") -> Array:
+    """Return the two-loop product of the inverse Hessian estimate with the gradient."""
+    out = gradient.copy()
+    shares = []
+    for change, turn in reversed(pairs):
+        share = float(change @ out) / float(change @ turn)
+        out -= share * turn
+        shares.append(share)
+    if pairs:
+        change, turn = pairs[-1]
+        out *= float(change @ turn) / float(turn @ turn)
+    for (change, turn), share in zip(pairs, reversed(shares), strict=True):
+        out += (share - float(turn @ out) / float(change @ turn)) * change
+    return out

@@ -1,0 +1,177 @@
+"""From cells to the ten packets of the paper's profile: fit, calibrate, deal over fragments."""
+
+from collections.abc import Generator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware.compression.binning import coarsened
+from firmware.compression.calibration import calibrated
+from firmware.compression.fit import FitFrame, FittedPoints, fit_frame, fit_steps
+from firmware.compression.initial import hilbert_order
+from firmware.compression.kernels import Hyperparameters, Kernel
+from firmware.compression.results import (
+    PAPER_FRAGMENTS,
+    PAPER_POINTS,
+    CompressedPoints,
+    FitReport,
+)
+from firmware.compression.settings import CompressionSettings
+from firmware.geometry import Array
+from firmware.submaps import BinnedSoundings
+from protocol.errors import EstimationError
+from protocol.packets import DEEPEST_M, FARTHEST_M, HIGHEST_M, Profile
+
+_CALIBRATE_EVERY = 6  # evaluations: calibration costs as much as one
+_FEWEST_CELLS = 3  # a hull needs a triangle
+
+
+def compress_point_steps(
+    bins: BinnedSoundings, settings: CompressionSettings
+) -> Generator[CompressedPoints, None, None]:
+    """Yield the best compressed sub-map so far, again and again, in steps of a few milliseconds.
+
+    The first comes at once: cells as they are. Each later one is at least as good, by expected
+    error on the cells; the last is the result.
+
+    Raises
+    ------
+    EstimationError
+        For fewer than three usable cells, of which no map can be made.
+    """
+    bins = usable(bins)
+    if bins.depth_m.size < _FEWEST_CELLS:
+        raise EstimationError(
+            f"{bins.depth_m.size} usable cells of soundings; a sub-map needs {_FEWEST_CELLS}"
+        )
+    cells = coarsened(bins, settings.fit_cell_m)
+    count = min(PAPER_FRAGMENTS * PAPER_POINTS, cells.depth_m.size)
+    best = _unfitted(cells, count)
+    yield best
+    frame = fit_frame(cells, settings.max_fit_rows)
+    steps = fit_steps(frame, count, PAPER_FRAGMENTS, settings)
+    waiting: FittedPoints | None = None
+    packed_at = 0
+    while True:
+        try:
+            step = next(steps)
+        except StopIteration as stop:
+            ended = str(stop.value)
+            break
+        except EstimationError as error:  # not to be factorised at any nugget
+            ended = str(error)
+            break
+        if step is not None:
+            waiting = step
+            if step.evaluations >= packed_at + _CALIBRATE_EVERY or not packed_at:
+                best, packed_at, waiting = (
+                    _packed(step, frame, bins, "running"),
+                    step.evaluations,
+                    None,
+                )
+                yield best
+                continue
+        yield best
+    if waiting is not None:
+        yield _packed(waiting, frame, bins, ended)
+    else:
+        yield _renamed(best, ended)
+
+
+def usable(bins: BinnedSoundings) -> BinnedSoundings:
+    """Return the cells that a packet can carry: finite and within any survey's bounds."""
+    good = np.isfinite(bins.north_m) & np.isfinite(bins.east_m) & np.isfinite(bins.depth_m)
+    good &= np.isfinite(bins.variance_m2) & (bins.count > 0)
+    with np.errstate(invalid="ignore"):
+        good &= (np.abs(bins.north_m) <= FARTHEST_M) & (np.abs(bins.east_m) <= FARTHEST_M)
+        good &= (bins.depth_m >= HIGHEST_M) & (bins.depth_m <= DEEPEST_M)
+    if good.all():
+        return bins
+    return BinnedSoundings(
+        cell_m=bins.cell_m,
+        north_m=bins.north_m[good],
+        east_m=bins.east_m[good],
+        depth_m=bins.depth_m[good],
+        variance_m2=bins.variance_m2[good],
+        count=bins.count[good],
+        time_s=bins.time_s[good],
+    )
+
+
+def _unfitted(cells: BinnedSoundings, count: int) -> CompressedPoints:
+    """Return cells along a Hilbert curve as they are: what can be sent before any fit."""
+    position_m = np.column_stack([cells.north_m, cells.east_m])
+    order = hilbert_order(position_m)
+    chosen = order[np.linspace(0, len(order) - 1, count).round().astype(int)]
+    span_m = np.maximum(np.ptp(position_m, axis=0), 1.0)
+    hyper = Hyperparameters(
+        b_per_m=float(0.5 / np.sqrt(span_m[0] * span_m[1] / count)),
+        c_m2=max(float(cells.depth_m.var()), 1e-4),
+        sigma2_m2=max(float(np.median(cells.variance_m2 * cells.count)), 1e-6),
+        mean_depth_m=float(cells.depth_m.mean()),
+        kernel=Kernel.MATERN32,
+    )
+    points = np.column_stack([position_m[chosen], cells.depth_m[chosen]])
+    fragment = np.arange(count) % PAPER_FRAGMENTS
+    return CompressedPoints(
+        profile=Profile.SUBMAP_PAPER,
+        fragment_count=PAPER_FRAGMENTS,
+        points_ned_m=dealt(points, fragment, PAPER_FRAGMENTS, PAPER_POINTS),
+        hyperparameters=hyper.to_wire(),
+        report=FitReport(),
+    )
+
+
+def _packed(
+    fitted: FittedPoints, frame: FitFrame, bins: BinnedSoundings, ended: str
+) -> CompressedPoints:
+    hyper = Hyperparameters(
+        b_per_m=fitted.b_per_m,
+        c_m2=1.0,
+        sigma2_m2=0.0,
+        mean_depth_m=frame.mean_depth_m,
+        kernel=fitted.kernel,
+    )
+    points = np.column_stack(
+        [fitted.position_m + frame.origin_m, fitted.depth_m + frame.mean_depth_m]
+    )
+    hyper, _ = calibrated(points, hyper, bins)
+    return CompressedPoints(
+        profile=Profile.SUBMAP_PAPER,
+        fragment_count=PAPER_FRAGMENTS,
+        points_ned_m=dealt(points, fitted.fragment, PAPER_FRAGMENTS, PAPER_POINTS),
+        hyperparameters=hyper.to_wire(),
+        report=FitReport(
+            evaluations=fitted.evaluations,
+            failed_factorisations=fitted.failed_factorisations,
+            ended=ended,
+            expected_rmse_m=float(np.sqrt(max(fitted.error_m2, 0.0))),
+        ),
+    )
+
+
+def _renamed(best: CompressedPoints, ended: str) -> CompressedPoints:
+    report = FitReport(
+        evaluations=best.report.evaluations,
+        failed_factorisations=best.report.failed_factorisations,
+        ended=ended,
+        expected_rmse_m=best.report.expected_rmse_m,
+    )
+    return CompressedPoints(
+        profile=best.profile,
+        fragment_count=best.fragment_count,
+        points_ned_m=best.points_ned_m,
+        hyperparameters=best.hyperparameters,
+        report=report,
+    )
+
+
+def dealt(
+    points_ned_m: Array, fragment: NDArray[np.intp], fragments: int, each: int
+) -> NDArray[np.float32]:
+    """Return the points (F x each, 3) in the order of their fragments, NaN where one is short."""
+    out = np.full((fragments, each, 3), np.nan, dtype=np.float32)
+    for index in range(fragments):
+        mine = points_ned_m[fragment == index][:each]
+        out[index, : len(mine)] = mine
+    return out.reshape(-1, 3)

@@ -1,0 +1,40 @@
+"""What the compressor hands on."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.packets import Profile
+
+PAPER_FRAGMENTS, PAPER_POINTS = 10, 15
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FitReport:
+    """How a fit went: nothing that failed is silent."""
+
+    evaluations: int = 0
+    failed_factorisations: int = 0
+    ended: str = "not fitted"
+    expected_rmse_m: float = float("nan")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CompressedPoints:
+    """Pseudo points of the `paper` or `dense` profile, in the order of their fragments.
+
+    points_ned_m is (M, 3), NaN where a place stays unused; the first M / F rows are fragment 0's.
+    hyperparameters is (4,) as on the wire.
+    """
+
+    profile: Profile
+    fragment_count: int
+    points_ned_m: NDArray[np.float32]
+    hyperparameters: NDArray[np.float32]
+    report: FitReport
+
+
+def fragment_points(compressed: CompressedPoints) -> NDArray[np.float32]:
+    """Return the points as (F, M / F, 3), by fragment."""
+    return compressed.points_ned_m.reshape(compressed.fragment_count, -1, 3)

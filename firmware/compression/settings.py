@@ -1,0 +1,56 @@
+"""What the compressor may be told; every number with its unit and its reason."""
+
+from dataclasses import dataclass
+
+from protocol.settings import Settings, setting
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BinningSettings(Settings):
+    """How soundings are thinned while they stream in."""
+
+    cell_m: float = setting(
+        1.0, "m", "about three soundings a cell at 40 m altitude", minimum=0.05, maximum=100.0
+    )
+    max_cells: int = setting(
+        32768, "cells", "a 120 degree swath at 100 m altitude over 40 s", minimum=64, maximum=10**6
+    )
+    reservoir: int = setting(
+        6, "soundings", "kept per cell so that its median is known", minimum=1, maximum=15
+    )
+    flier_gate: float = setting(
+        4.5, "robust sigma", "a Gaussian loses 7 soundings in a million", minimum=2.0
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CompressionSettings(Settings):
+    """How a sub-map is fitted and how much work that may take."""
+
+    method: str = setting(
+        "expected",
+        "name",
+        "fitted through the leader's decoder for the loss to expect; `fitc` is Eq. 1-6",
+        choices=("expected", "fitc"),
+    )
+    kernel: str = setting(
+        "auto",
+        "name",
+        "the one with the least error at the first points, of those that measured well",
+        choices=("auto", "squared_exponential", "matern32", "exponential"),
+    )
+    expected_loss: float = setting(
+        0.14, "share", "one frame in seven, as in the paper", minimum=0.0, maximum=0.9
+    )
+    fit_cell_m: float = setting(
+        2.0, "m", "ten times fewer rows than soundings for 3-5 % of the error", minimum=0.1
+    )
+    max_fit_rows: int = setting(
+        4096, "rows", "bounds memory and the longest step", minimum=64, maximum=65536
+    )
+    iterations: int = setting(
+        25, "evaluations", "0.3 s of one core; the error has then nearly settled", minimum=0
+    )
+    dense_points: int = setting(
+        430, "points", "as many as ten frames hold beside the track", minimum=10, maximum=450
+    )

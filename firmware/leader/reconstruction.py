@@ -1,0 +1,171 @@
+"""Sub-maps rebuilt on a grid from the pseudo points that arrived.
+
+Source: paper, section 4.2: Gaussian process regression (Eq. 5, 6) inside the outer edges of the
+points' Delaunay triangulation; depths with a variance above 0.1 are dropped.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+
+from firmware.compression.decoder import PointDecoder, point_decoder
+from firmware.compression.kernels import Hyperparameters
+from firmware.geometry import Array
+from firmware.submaps import GriddedSubmap, Track
+from protocol.errors import EstimationError
+from protocol.packets import SubmapFragment, SubmapPacket, usable_states
+from protocol.settings import Settings, setting
+from protocol.timestamps import from_quarters
+
+_MAX_POINTS = 600  # ten frames hold fewer; the decoder's matrices are bounded by it
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReconstructionSettings(Settings):
+    """The leader's grid, and which of its cells are kept."""
+
+    cell_m: float = setting(2.0, "m", "the grid of the matching (paper, 6.1)", minimum=0.05)
+    max_variance_m2: float = setting(0.1, "m2", "paper, 4.2: above it depths are dropped")
+    max_cells: int = setting(
+        1_000_000, "cells", "25 MB; a swath at 1 m has 22,500", minimum=100, maximum=10_000_000
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reconstruction:
+    """A sub-map as the leader has it: the grid, and the states that arrived."""
+
+    grid: GriddedSubmap
+    track: Track
+
+
+def reconstruct_packets(
+    fragments: Mapping[int, SubmapPacket | SubmapFragment],
+    settings: ReconstructionSettings,
+    near_s: float,
+) -> Reconstruction:
+    """Return the sub-map of the fragments that arrived; near_s is about when it was measured.
+
+    Raises
+    ------
+    EstimationError
+        When the fragments hold nothing a map can be made of.
+    """
+    packets = [p for _, p in sorted(fragments.items()) if isinstance(p, SubmapPacket)]
+    if not packets:
+        raise EstimationError("none of the fragments holds pseudo points")
+    points_ned_m = np.concatenate([p.points_ned_m[p.usable_points] for p in packets])
+    track = track_of_packets(packets, near_s)
+    grid = reconstruct_points(points_ned_m, packets[0].hyperparameters, track, settings)
+    return Reconstruction(grid=grid, track=track)
+
+
+def track_of_packets(packets: list[SubmapPacket], near_s: float) -> Track:
+    """Return the usable states of the packets' slices, by time."""
+    rows = []
+    for packet in packets:
+        good = usable_states(packet.trajectory)
+        first_s = from_quarters(packet.header.time_quarters, near_s)
+        times_s = first_s + np.arange(len(good), dtype=np.float64)
+        rows.append(np.column_stack([times_s, packet.trajectory])[good])
+    states = np.concatenate(rows) if rows else np.empty((0, 4))
+    states = states[np.argsort(states[:, 0], kind="stable")]
+    return Track(
+        time_s=states[:, 0], north_m=states[:, 1], east_m=states[:, 2], yaw_rad=states[:, 3]
+    )
+
+
+def reconstruct_points(
+    points_ned_m: NDArray[np.float32] | Array,
+    hyperparameters: NDArray[np.float32] | Array,
+    track: Track,
+    settings: ReconstructionSettings,
+) -> GriddedSubmap:
+    """Return the grid inside the hull of the points (M, 3); whatever the numbers, it is bounded.
+
+    Raises
+    ------
+    EstimationError
+        When fewer than three points are usable, or they lie on one line.
+    """
+    points = np.asarray(points_ned_m, dtype=np.float64)[:_MAX_POINTS]
+    with np.errstate(invalid="ignore"):
+        good = np.isfinite(points).all(axis=1) & (np.abs(points) < 1e6).all(axis=1)
+    points = points[good]
+    if len(points) < 3:
+        raise EstimationError(f"{len(points)} usable points; a hull needs three")
+    hyper = Hyperparameters.from_wire(
+        np.asarray(hyperparameters, dtype=np.float64), float(np.median(points[:, 2]))
+    )
+    decoder = point_decoder(points, hyper)
+    north_m, east_m = _axes(points[:, :2], settings)
+    inside = _inside(points[:, :2], north_m, east_m)
+    depth_m, variance_m2 = _gridded(decoder, north_m, east_m, inside)
+    depth_m[variance_m2 > settings.max_variance_m2] = np.nan
+    variance_m2[np.isnan(depth_m)] = np.nan
+    return GriddedSubmap(
+        north0_m=float(north_m[0]),
+        east0_m=float(east_m[0]),
+        cell_m=settings.cell_m,
+        depth_m=depth_m,
+        variance_m2=variance_m2,
+        time_s=times_of_cells(track, north_m, east_m, np.isfinite(depth_m)),
+    )
+
+
+def _axes(position_m: Array, settings: ReconstructionSettings) -> tuple[Array, Array]:
+    """Return the grid's north and east, on multiples of the cell, cut about the points' middle."""
+    cell_m = settings.cell_m
+    low, high = position_m.min(axis=0), position_m.max(axis=0)
+    sides = np.floor(high / cell_m) - np.ceil(low / cell_m) + 1
+    if sides[0] * sides[1] > settings.max_cells:
+        reach_m = 0.5 * cell_m * (np.sqrt(settings.max_cells) - 2.0)
+        middle = np.median(position_m, axis=0)
+        low, high = np.maximum(low, middle - reach_m), np.minimum(high, middle + reach_m)
+    first = np.ceil(low / cell_m).astype(np.int64)
+    last = np.maximum(np.floor(high / cell_m).astype(np.int64), first)
+    return (
+        cell_m * np.arange(first[0], last[0] + 1, dtype=np.float64),
+        cell_m * np.arange(first[1], last[1] + 1, dtype=np.float64),
+    )
+
+
+def _inside(position_m: Array, north_m: Array, east_m: Array) -> NDArray[np.bool_]:
+    """Return (R, C) which cells lie in the convex hull: the outline of the triangulation."""
+    middle = position_m.mean(axis=0)
+    try:
+        hull = ConvexHull(position_m - middle)
+    except QhullError as error:
+        raise EstimationError("the points lie on one line; a map needs an area") from error
+    inside = np.ones((north_m.size, east_m.size), dtype=bool)
+    for by_north, by_east, offset in hull.equations:
+        along = by_north * (north_m - middle[0])
+        across = by_east * (east_m - middle[1]) + offset
+        inside &= along[:, None] <= 1e-9 - across[None, :]
+    return inside
+
+
+def _gridded(
+    decoder: PointDecoder, north_m: Array, east_m: Array, inside: NDArray[np.bool_]
+) -> tuple[Array, Array]:
+    depth_m = np.full(inside.shape, np.nan)
+    variance_m2 = np.full(inside.shape, np.inf)
+    row, column = np.nonzero(inside)
+    depth_m[inside], variance_m2[inside] = decoder.predict(
+        np.column_stack([north_m[row], east_m[column]])
+    )
+    return depth_m, variance_m2
+
+
+def times_of_cells(track: Track, north_m: Array, east_m: Array, wanted: NDArray[np.bool_]) -> Array:
+    """Return (R, C) the time of the state nearest to each wanted cell, NaN elsewhere."""
+    time_s = np.full(wanted.shape, np.nan)
+    if track.time_s.size and wanted.any():
+        row, column = np.nonzero(wanted)
+        states_m = np.column_stack([track.north_m, track.east_m])
+        _, nearest = cKDTree(states_m).query(np.column_stack([north_m[row], east_m[column]]))
+        time_s[wanted] = track.time_s[nearest]
+    return time_s

@@ -1,0 +1,73 @@
+"""The paper's profile: fit, packets, and the way back."""
+
+import numpy as np
+import pytest
+
+from firmware.compression import compress, compress_steps, fragment_points, packets_from
+from firmware.compression.settings import CompressionSettings
+from firmware.leader.reconstruction import ReconstructionSettings, reconstruct_packets
+from protocol.codec import decode, encode
+from protocol.packets import Header, Profile, SubmapPacket
+from tests.compression.conftest import Survey, relief_m
+
+QUICK = CompressionSettings(iterations=8)
+HEADER = Header(
+    profile=Profile.SUBMAP_PAPER,
+    vehicle=1,
+    boot_epoch=0,
+    submap=3,
+    fragment=0,
+    fragment_count=10,
+    tx_second=0,
+    time_quarters=400,
+)
+
+
+@pytest.fixture(scope="module")
+def packets(survey: Survey) -> list[SubmapPacket]:
+    received = []
+    for packet in packets_from(compress(survey.bins, QUICK), survey.track, HEADER):
+        decoded = decode(encode(packet))
+        assert isinstance(decoded, SubmapPacket)
+        received.append(decoded)
+    return received
+
+
+def rmse_m(packets: list[SubmapPacket], drop: set[int]) -> float:
+    arrived = {i: p for i, p in enumerate(packets) if i not in drop}
+    grid = reconstruct_packets(arrived, ReconstructionSettings(cell_m=1.0), 100.0).grid
+    north_m = grid.north0_m + grid.cell_m * np.arange(grid.depth_m.shape[0])
+    east_m = grid.east0_m + grid.cell_m * np.arange(grid.depth_m.shape[1])
+    true_m = relief_m(*np.meshgrid(north_m, east_m, indexing="ij"))
+    return float(np.sqrt(np.nanmean((grid.depth_m - true_m) ** 2)))
+
+
+def test_ten_packets_of_fifteen_points_carry_the_map(packets: list[SubmapPacket]) -> None:
+    assert len(packets) == 10
+    assert all(packet.points_ned_m.shape == (15, 3) for packet in packets)
+    assert rmse_m(packets, set()) < 0.15  # m, of a relief of 1.3 m standard deviation
+
+
+def test_two_lost_packets_cost_little(packets: list[SubmapPacket]) -> None:
+    assert rmse_m(packets, {2, 7}) < 2.0 * rmse_m(packets, set())
+
+
+def test_trajectory_comes_back_in_slices(packets: list[SubmapPacket], survey: Survey) -> None:
+    arrived = {i: p for i, p in enumerate(packets) if i != 4}
+    track = reconstruct_packets(arrived, ReconstructionSettings(), 100.0).track
+    assert track.time_s.size == 36
+    assert track.time_s[0] == 100.0
+    np.testing.assert_allclose(track.north_m[:16], survey.track.north_m[:16], atol=1e-4)
+
+
+def test_every_step_is_no_worse_than_the_one_before(survey: Survey) -> None:
+    errors = [step.report.expected_rmse_m for step in compress_steps(survey.bins, QUICK)]
+    fitted = [error for error in errors if np.isfinite(error)]
+    assert len(errors) > 20
+    assert all(later <= earlier for earlier, later in zip(fitted, fitted[1:], strict=False))
+
+
+def test_points_of_one_fragment_are_spread_over_the_whole_map(survey: Survey) -> None:
+    for points in fragment_points(compress(survey.bins, CompressionSettings(iterations=1))):
+        assert np.ptp(points[:, 0]) > 50.0
+        assert np.ptp(points[:, 1]) > 80.0

@@ -26,6 +26,7 @@ from protocol.modems.micromodem_reception import (
 )
 from protocol.modems.micromodem_settings import FLEXIBLE_BYTES, MicroModemSettings
 from protocol.modems.micromodem_setup import Setup
+from protocol.modems.micromodem_states import State
 from protocol.modems.nmea import Sentence, encode
 from protocol.modems.stamping import Stamp, stamp_frame
 
@@ -287,7 +288,8 @@ class Traffic(Setup):
     def _take_error(self, sentence: Sentence, now_s: float) -> None:
         """Fail at once what the modem refuses, instead of waiting for its answer."""
         self.counters["errors"] += 1
-        self._complain("modem says " + ",".join(sentence.fields)[:80], now_s)
+        if self.state is not State.DUMPING:  # one of the two ways to ask is always refused
+            self._complain("modem says " + ",".join(sentence.fields[1:])[:80], now_s)
         told = ",".join(sentence.fields[1:]).upper()
         if "NMEA" in told or "TIMEOUT" in told or "BUSY" in told:
             self._fire("refused", sentence, now_s)

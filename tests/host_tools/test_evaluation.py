@@ -1,5 +1,6 @@
 import csv
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from host_tools.evaluation import (
 )
 from host_tools.mapping import DepthMap
 from host_tools.registration import registration_error, tile_shifts
+from host_tools.report import write_report
 from host_tools.results import ClosureResult, MissionResult, SoundingPatch, VehicleResult
 from host_tools.scenario import named_scenario
 from host_tools.simulator.placement import Site, Window, place_survey
@@ -335,6 +337,16 @@ def test_map_of_true_soundings_lies_on_the_terrain(mission: MissionResult, tmp_p
     assert float(difference_m.std()) < 0.25
     assert sigma_m.count() == elevation_m.count()
     assert evaluation.registration.mean_m < 1e-2
+
+
+def test_report_is_one_file_that_needs_no_other(mission: MissionResult, tmp_path: Path) -> None:
+    path = tmp_path / "report.html"
+    write_report(mission, evaluate(mission), path)
+    page = path.read_text(encoding="utf-8")
+    assert page.count("data:image/png;base64,") == 5
+    assert "rotation about the range is unobservable" in page
+    assert "http" not in page.replace("http-equiv", "")
+    assert not re.search(r"<(script|link)\b", page)
 
 
 def test_unwritable_output_is_a_clear_error(tmp_path: Path) -> None:

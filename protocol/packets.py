@@ -165,7 +165,7 @@ class SubmapPacket(_BitwiseEqual):
     trajectory is (4, 3) float32: north_m, east_m, yaw_rad in raw dead reckoning, one state a second
     from the header's time; NaN where there is none. points_ned_m is (15, 3) float32 (14 rows in a
     sealed frame): north, east, depth; NaN where there is none. hyperparameters is (4,) float32: b,
-    c, sigma2_m2, mean depth_m, the same in all fragments.
+    c, sigma2_m2, mean depth_m, the same in all fragments; signs tell the kernel, see WIRE.md.
     """
 
     SIZE_BYTES: ClassVar[int] = FRAME_BYTES
@@ -186,12 +186,10 @@ class SubmapPacket(_BitwiseEqual):
 
     @property
     def has_usable_hyperparameters(self) -> bool:
-        """Whether b and c are positive, sigma2 not negative, and all four finite."""
-        b, c, sigma2_m2, mean_depth_m = (float(value) for value in self.hyperparameters)
+        """Whether all four are finite, b and c not zero, and the mean depth plausible."""
+        b, c, _, mean_depth_m = (float(value) for value in self.hyperparameters)
         finite = bool(np.isfinite(self.hyperparameters).all())
-        return (
-            finite and b > 0 and c > 0 and sigma2_m2 >= 0 and HIGHEST_M <= mean_depth_m <= DEEPEST_M
-        )
+        return finite and b != 0.0 and c != 0.0 and HIGHEST_M <= mean_depth_m <= DEEPEST_M
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

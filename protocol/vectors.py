@@ -28,6 +28,7 @@ from protocol.packets import (
     SubmapPacket,
     TrajectoryPacket,
 )
+from protocol.seal import Keys, Sealer
 
 
 def _header(profile: Profile, **changes: int) -> Header:
@@ -117,6 +118,32 @@ def packets() -> dict[str, Packet]:
     }
 
 
+SEAL_KEY = bytes(range(32))
+SEAL_COUNTER = 0x01020304
+
+
+class _OneCounter:
+    """Seals every vector with the same number, which a vehicle would never do."""
+
+    def next(self) -> int:
+        return SEAL_COUNTER
+
+
+def sealed() -> dict[str, tuple[bytes, Packet]]:
+    """Return frames sealed by BLAKE2s with the packet that they open to."""
+    sealer = Sealer(Keys(SEAL_KEY), _OneCounter())
+    found = {}
+    for name, packet in packets().items():
+        if isinstance(packet, SubmapPacket):
+            packet = replace(packet, points_ned_m=packet.points_ned_m[:14])  # noqa: PLW2901
+        elif isinstance(packet, TrajectoryPacket):
+            packet = replace(packet, states=packet.states[:-1])  # noqa: PLW2901
+        elif isinstance(packet, SubmapFragment):
+            packet = replace(packet, body=packet.body[:-12])  # noqa: PLW2901
+        found[f"{name}, sealed"] = sealer.seal(packet), packet
+    return found
+
+
 def rejects() -> dict[str, tuple[bytes, str]]:
     """Return bytes that are no frame, with the cause of rejection, by the name of the vector."""
     known = packets()
@@ -178,6 +205,18 @@ def frames_document() -> dict[str, object]:
     }
 
 
+def seal_document() -> dict[str, object]:
+    """Return the vectors of sealed frames as they stand in seal.json."""
+    return {
+        "key": SEAL_KEY.hex(),
+        "counter": SEAL_COUNTER,
+        "accepted": [
+            {"name": name, "hex": frame.hex(), "opened": packet_fields(packet)}
+            for name, (frame, packet) in sealed().items()
+        ],
+    }
+
+
 def line_document() -> dict[str, object]:
     """Return the vectors of the serial framing as they stand in line.json."""
     return {
@@ -211,7 +250,8 @@ def _json_float(value: float) -> float | str:
 def main(arguments: list[str]) -> None:
     """Write all vector files into the folder given."""
     folder = Path(arguments[0])
-    for name, document in (("frames", frames_document()), ("line", line_document())):
+    documents = {"frames": frames_document(), "line": line_document(), "seal": seal_document()}
+    for name, document in documents.items():
         (folder / f"{name}.json").write_text(json.dumps(document, indent=1) + "\n")
 
 

@@ -197,7 +197,7 @@ def test_unused_and_absurd_values_are_told_from_usable_ones() -> None:
     packet = replace(packet, points_ned_m=points, hyperparameters=np.ones(4, np.float32))
     assert packet.usable_points.tolist() == [False] * 4 + [True] * 11
     assert packet.has_usable_hyperparameters
-    for bad in ([0, 1, 1, 1], [1, -1, 1, 1], [1, 1, np.nan, 1], [1, 1, 1, 1e9]):
+    for bad in ([0, 1, 1, 1], [1, 0, 1, 1], [1, 1, np.nan, 1], [1, 1, 1, 1e9]):
         unusable = replace(packet, hyperparameters=np.array(bad, np.float32))
         assert not unusable.has_usable_hyperparameters
 

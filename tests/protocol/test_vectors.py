@@ -12,6 +12,7 @@ from protocol.errors import RemoteProtocolError
 from protocol.framing import LineReader
 from protocol.layouts import BODIES, HEADER_FIELDS, fingerprint
 from protocol.packets import BODY_BYTES, SIZE_BYTES, VERSION, Profile
+from protocol.seal import Keys, Opener, receiver_of
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "tests" / "vectors"
@@ -23,7 +24,7 @@ def load(name: str) -> dict[str, Any]:
     return document
 
 
-FRAMES, LINE = load("frames"), load("line")
+FRAMES, LINE, SEAL = load("frames"), load("line"), load("seal")
 
 
 def ids(vector: dict[str, Any]) -> str:
@@ -62,6 +63,13 @@ def test_line_vectors_give_their_frames(vector: dict[str, Any]) -> None:
     while (line_frame := reader.next_frame()) is not None:
         found.append(line_frame.frame.hex())
     assert found[-len(vector["frames"]) :] == vector["frames"]
+
+
+@pytest.mark.parametrize("vector", SEAL["accepted"], ids=ids)
+def test_sealed_vectors_open_to_their_fields(vector: dict[str, Any]) -> None:
+    packet = decode(bytes.fromhex(vector["hex"]))
+    opener = Opener(receiver_of(packet.header), Keys(bytes.fromhex(SEAL["key"])))
+    assert vectors.packet_fields(opener.open(packet)) == vector["opened"]
 
 
 def test_every_plain_profile_has_a_vector() -> None:

@@ -1,0 +1,100 @@
+"""What a subcommand is, and the arguments that several of them share."""
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from host_tools.mission_settings import MissionSettings, changed
+from host_tools.scenario import load_scenario
+from protocol.errors import ConfigError
+
+PROFILES = ("paper", "dense", "lattice")
+BASELINES = ("none", "unlimited", "octree")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Command:
+    """One subcommand: its name, a line of help, its arguments, and what it does."""
+
+    name: str
+    help: str
+    configure: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace], None]
+
+
+def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add --scenario, --loss and --set."""
+    parser.add_argument(
+        "--scenario",
+        default="paper-1",
+        metavar="NAME|FILE.toml",
+        help="paper-1, paper-2, field-1, day-1, or a file of scenario keys (default: paper-1)",
+    )
+    parser.add_argument(
+        "--loss", type=float, metavar="P", help="share of frames lost per receiver, both ways"
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        dest="changes",
+        help="change a setting; `fathomlink config show` lists them; may be repeated",
+    )
+
+
+def add_mission_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what says which mission is simulated: terrain, scenario, seed, profile, settings."""
+    parser.add_argument(
+        "--terrain",
+        type=Path,
+        metavar="FILE",
+        help="GeoTIFF, BAG or other raster in a metric projection; default: a built-in relief",
+    )
+    add_settings_arguments(parser)
+    parser.add_argument("--seed", type=seed, default=1, metavar="N", help="default: 1")
+    parser.add_argument("--profile", choices=PROFILES, default="paper", help="default: paper")
+    parser.add_argument("--baseline", choices=BASELINES, default="none", help="default: none")
+
+
+def settings_of(arguments: argparse.Namespace) -> MissionSettings:
+    """Return the settings that --scenario, --loss and --set mean, the last given first in rank.
+
+    Raises
+    ------
+    ConfigError
+        For an unknown scenario or key, or a value that cannot be.
+    """
+    settings = MissionSettings(scenario=load_scenario(arguments.scenario))
+    changes = parse_changes(arguments.changes)
+    if arguments.loss is not None:
+        changes = {"scenario.water.loss": arguments.loss, **changes}
+    settings = changed(settings, changes)
+    settings.scenario.check()
+    return settings
+
+
+def parse_changes(texts: Sequence[str]) -> dict[str, object]:
+    """Return the KEY=VALUE texts as a mapping; a later one replaces an earlier one.
+
+    Raises
+    ------
+    ConfigError
+        For a text without an equals sign.
+    """
+    changes: dict[str, object] = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not equals or not key.strip():
+            raise ConfigError(f"--set {text!r} is not KEY=VALUE, such as --set duration_min=10")
+        changes[key.strip()] = value.strip()
+    return changes
+
+
+def seed(text: str) -> int:
+    """Return the text as a seed, 0 or more."""
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{text} is negative; a seed is 0 or more")
+    return value

@@ -1,0 +1,141 @@
+"""`fathomlink inspect FILE`: what the frames of a file say, one line each."""
+
+import argparse
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from host_tools.commands import Command
+from protocol.codec import decode
+from protocol.errors import ConfigError, RemoteProtocolError
+from protocol.packets import (
+    SIZE_BYTES,
+    Answer,
+    ExtendedAnswer,
+    Packet,
+    Profile,
+    SealedFrame,
+    SubmapFragment,
+    SubmapPacket,
+    TrajectoryPacket,
+    usable_states,
+)
+
+SIZES = {int(profile): size for profile, size in SIZE_BYTES.items()}
+
+
+def inspect_file(path: Path) -> Iterator[str]:
+    """Yield one line for every frame of an air.jsonl, or of a file of frames back to back.
+
+    Raises
+    ------
+    ConfigError
+        When the file cannot be read or holds no frame at all.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}: {error.strerror}") from error
+    if not data:
+        raise ConfigError(f"{path} is empty; give a file of frames or an air.jsonl")
+    if data.lstrip()[:1] == b"{":
+        yield from _inspect_air(path, data)
+    else:
+        yield from _inspect_frames(data)
+
+
+def _inspect_air(path: Path, data: bytes) -> Iterator[str]:
+    for number, line in enumerate(data.splitlines(), start=1):
+        try:
+            record = json.loads(line)
+            frame = bytes.fromhex(record["hex"])
+            head = (
+                f"{record['t_tx_s']:10.3f} s  {record['source']} -> {record['destination']}"
+                f"  {record['fate']:<11}"
+            )
+        except (ValueError, KeyError, TypeError) as error:
+            raise ConfigError(
+                f"{path}, line {number}: not a line of air.jsonl ({error})"
+            ) from error
+        yield f"{head}  {describe(frame)}"
+
+
+def _inspect_frames(data: bytes) -> Iterator[str]:
+    """Yield a line a frame; after damage, look for the next byte at which a frame decodes."""
+    offset = skipped = 0
+    while offset < len(data):
+        size = SIZES.get(data[offset] & 31, 0)
+        frame = data[offset : offset + size]
+        if size and len(frame) == size and _decodes(frame):
+            if skipped:
+                yield f"{offset - skipped:8d}  {skipped} bytes that are no frame"
+                skipped = 0
+            yield f"{offset:8d}  {describe(frame)}"
+            offset += size
+        else:
+            offset, skipped = offset + 1, skipped + 1
+    if skipped:
+        yield f"{offset - skipped:8d}  {skipped} bytes that are no frame"
+
+
+def _decodes(frame: bytes) -> bool:
+    try:
+        decode(frame)
+    except RemoteProtocolError:
+        return False
+    return True
+
+
+def describe(frame: bytes) -> str:
+    """Return a line on what a frame holds, or why it would be dropped."""
+    try:
+        packet = decode(frame)
+    except RemoteProtocolError as error:
+        return f"{len(frame)} bytes, dropped: {error}"
+    header = packet.header
+    name = Profile(header.profile).name.lower().replace("_", " ")
+    sender = f"vehicle {header.vehicle} epoch {header.boot_epoch}"
+    part = f"submap {header.submap} fragment {header.fragment}/{header.fragment_count}"
+    when = f"t {header.time_quarters / 4:.2f} s, sent at second {header.tx_second} of 16"
+    return f"{name:<16} {sender}  {part}  {when}  {_content(packet)}"
+
+
+def _content(packet: Packet) -> str:
+    match packet:
+        case SubmapPacket():
+            states = int(usable_states(packet.trajectory).sum())
+            points = int(packet.usable_points.sum())
+            b, c, sigma2_m2, mean_m = (float(value) for value in packet.hyperparameters)
+            return (
+                f"{states} states, {points} points, b {b:.4g}, c {c:.4g}, "
+                f"sigma2 {sigma2_m2:.4g} m2, mean depth {mean_m:.2f} m"
+            )
+        case TrajectoryPacket():
+            good = usable_states(packet.states)
+            if not good.any():
+                return "no states"
+            last = packet.states[np.flatnonzero(good)[-1]]
+            return f"{int(good.sum())} states to north {last[0]:.1f} m, east {last[1]:.1f} m"
+        case Answer() | ExtendedAnswer():
+            return (
+                f"to vehicle {packet.to_vehicle}, submap {packet.submap}: "
+                f"north {packet.north_m:.1f} m, east {packet.east_m:.1f} m"
+            )
+        case SubmapFragment():
+            return f"{len(packet.body)} bytes of body"
+        case SealedFrame():
+            return f"sealed, counter {packet.counter}"
+
+
+def _configure(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("file", type=Path, metavar="FILE", help="frames back to back, or air.jsonl")
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    for line in inspect_file(arguments.file):
+        print(line)
+
+
+COMMAND = Command(name="inspect", help="print what frames hold", configure=_configure, run=_run)

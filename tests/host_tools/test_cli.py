@@ -1,0 +1,156 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from host_tools.cli import main
+from protocol.codec import encode
+from protocol.packets import Answer, Header, Profile, SubmapPacket
+
+
+def frames() -> list[bytes]:
+    answer = Answer(
+        header=Header(
+            profile=Profile.ANSWER,
+            vehicle=0,
+            boot_epoch=0,
+            submap=3,
+            fragment=1,
+            fragment_count=0,
+            tx_second=3,
+            time_quarters=480,
+        ),
+        submap=2,
+        north_m=120.5,
+        east_m=-4.0,
+    )
+    fragment = SubmapPacket(
+        header=Header(
+            profile=Profile.SUBMAP_PAPER,
+            vehicle=1,
+            boot_epoch=0,
+            submap=12,
+            fragment=7,
+            fragment_count=10,
+            tx_second=8,
+            time_quarters=1920,
+        ),
+        trajectory=np.zeros((4, 3), dtype=np.float32),
+        points_ned_m=np.full((15, 3), 40.0, dtype=np.float32),
+        hyperparameters=np.array([0.1, 1.0, 0.02, 40.0], dtype=np.float32),
+    )
+    return [encode(answer), encode(fragment)]
+
+
+def test_config_show_lists_settings_with_units_and_reasons(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["config", "show", "--scenario", "paper-2", "--set", "leg_m=450"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    shown = {line.split(" = ")[0]: line for line in lines}
+    assert shown["scenario.leg_m"].startswith("scenario.leg_m = 450 m ")
+    assert shown["scenario.duration_min"].startswith("scenario.duration_min = 55 min")
+    assert "scenario.water.outlier_share" in shown
+    assert all("#" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    "change", ["duration_min=5", "leg_m=300", "outlier_share=0.8", "followers=2", "loss=0.3"]
+)
+def test_short_keys_of_the_contract_are_not_ambiguous(
+    change: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["config", "show", "--set", change]) == 0
+    captured = capsys.readouterr()
+    key, value = change.split("=")
+    assert f"{key} = {value}" in captured.out
+    assert captured.err == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--scenario", "paper-9"], "choose one of paper-1, paper-2, field-1, day-1"),
+        (["--set", "depth_of_field=3"], "unknown setting 'depth_of_field'"),
+        (["--set", "leg_m"], "is not KEY=VALUE"),
+        (["--set", "leg_m=long"], "give a value of type float"),
+        (["--loss", "1.5"], "must be at most 1"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["config", "show", *arguments]) == 2
+    captured = capsys.readouterr()
+    assert message in captured.err
+    assert captured.err.count("\n") == 1
+    assert captured.out == ""
+
+
+@pytest.mark.parametrize(
+    "arguments", [["swim"], ["inspect"], ["config", "show", "--loss", "much"], []]
+)
+def test_unreadable_arguments_are_one_line_and_status_2(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(arguments)
+    assert stopped.value.code == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_inspect_describes_frames_and_steps_over_garbage(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    answer, fragment = frames()
+    path = tmp_path / "frames.bin"
+    path.write_bytes(answer + b"\x21garbage" + fragment + fragment[:100])
+    assert main(["inspect", str(path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 4
+    assert "to vehicle 1, submap 2: north 120.5 m, east -4.0 m" in lines[0]
+    assert "8 bytes that are no frame" in lines[1]
+    assert "submap 12 fragment 7/10" in lines[2]
+    assert "15 points" in lines[2]
+    assert "100 bytes that are no frame" in lines[3]
+
+
+def test_inspect_reads_air_and_says_why_a_frame_is_dropped(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    answer, fragment = frames()
+    damaged = fragment[:50] + b"\xff" + fragment[51:]
+    path = tmp_path / "air.jsonl"
+    path.write_text(
+        "".join(
+            json.dumps(
+                {
+                    "t_tx_s": 4.0,
+                    "t_rx_s": None,
+                    "source": 1,
+                    "destination": 0,
+                    "hex": frame.hex(),
+                    "fate": "delivered",
+                }
+            )
+            + "\n"
+            for frame in (answer, damaged)
+        )
+    )
+    assert main(["inspect", str(path)]) == 0
+    first, second = capsys.readouterr().out.splitlines()
+    assert "1 -> 0  delivered" in first
+    assert "dropped" in second
+    assert "CRC" in second
+
+
+@pytest.mark.parametrize("content", [None, b"", b'{"t_tx_s": 1}\n'])
+def test_inspect_refuses_what_is_no_file_of_frames(
+    tmp_path: Path, content: bytes | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "file"
+    if content is not None:
+        path.write_bytes(content)
+    assert main(["inspect", str(path)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1

@@ -57,7 +57,7 @@ class ExpectedError:
         self._position_m = position_m.astype(np.float32)
         self._depth_m = depth_m.astype(np.float32)
         self._weight = (weight / weight.sum()).astype(np.float32)
-        self._total_m2 = float(np.dot(self._weight, depth_m**2))
+        self.total_m2 = float(np.dot(self._weight, depth_m**2))
         self._kernel = kernel
         self._no_loss = patterns.no_loss
         self._groups = _groups(patterns, fragment)
@@ -129,7 +129,7 @@ class ExpectedError:
         correction = inverse @ np.hstack(lost)
         stack = beta[:, None] - correction
         fitted = gram @ stack
-        error = self._total_m2 + self._ridge * float(beta @ k @ beta)
+        error = self.total_m2 + self._ridge * float(beta @ k @ beta)
         error += float(probability @ (np.einsum("mp,mp->p", stack, fitted) - 2.0 * moment @ stack))
         # the points' own K enters through Q, that is through the corrections
         pull = 2.0 * probability * (fitted - moment[:, None])

@@ -1,13 +1,14 @@
 """The fit of pseudo points through the leader's own decoder, for the losses to expect."""
 
+import dataclasses
 from collections.abc import Generator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware.compression.expected import Evaluation, ExpectedError
-from firmware.compression.initial import dealt_fragments, initial_points
+from firmware.compression.expected import Evaluation, ExpectedError, run
+from firmware.compression.initial import Outline, dealt_fragments, initial_points
 from firmware.compression.kernels import Kernel
 from firmware.compression.lbfgs import Improvement, Trial, minimise_steps
 from firmware.compression.losses import LossPatterns, loss_patterns
@@ -17,6 +18,7 @@ from firmware.submaps import BinnedSoundings
 
 _START_SCALES = (0.6, 1.2)  # length scales tried at first, in spacings of the points
 _TRIAL_ROWS = 1024  # rows that choose the kernel: a third, for a third of the time
+_OUTSIDE_PRICE = 1.0  # of leaving the cells' outline by a spacing, in shares of the variance
 _SHORTEST, _LONGEST = 0.2, 30.0  # length scale in spacings: between no and full correlation
 
 
@@ -32,6 +34,8 @@ class FittedPoints:
     error_m2: float
     evaluations: int
     failed_factorisations: int
+    c_m2: float = 1.0
+    sigma2_m2: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,15 +79,17 @@ def fit_steps(
     """Yield ever better fits, and None between small steps; the value says why it ended."""
     start_m, held = initial_points(frame.position_m, frame.depth_m, count)
     yield None
-    spacing_m = _spacing_m(start_m)
+    spacing_m = spacing_of(start_m)
     fragment = dealt_fragments(start_m, fragments)
-    patterns = loss_patterns(settings.expected_loss, fragments)
+    patterns = patterns_of(settings, fragments)
     yield None
     kernel, log_b = yield from _choose(frame, start_m, fragment, patterns, spacing_m, settings)
     problem = ExpectedError(
         frame.position_m, frame.depth_m, frame.weight, kernel, patterns, fragment, frame.ridge
     )
     lowest, highest = np.log(1.0 / (_LONGEST * spacing_m)), np.log(1.0 / (_SHORTEST * spacing_m))
+
+    outline = Outline.of(frame.position_m)
 
     def unpacked(x: Array) -> tuple[Array, float]:
         point_m = start_m.copy()
@@ -93,10 +99,14 @@ def fit_steps(
     def objective(x: Array) -> Generator[None, None, Trial[tuple[Array, float, Evaluation]]]:
         point_m, log_b = unpacked(x)
         result = yield from problem.steps(point_m, log_b)
-        by_x = np.append(spacing_m * result.by_position[held:].ravel(), result.by_log_b)
+        outside, by_outside = outline.excess(point_m[held:])
+        price = problem.total_m2 * _OUTSIDE_PRICE / spacing_m**2 / len(start_m)
+        by_position = result.by_position[held:] + price * by_outside
+        by_x = np.append(spacing_m * by_position.ravel(), result.by_log_b)
         if not lowest < x[-1] < highest:
             by_x[-1] = 0.0
-        return Trial(value=result.error_m2, gradient=by_x, payload=(point_m, log_b, result))
+        value = result.error_m2 + price * outside
+        return Trial(value=value, gradient=by_x, payload=(point_m, log_b, result))
 
     def fitted(step: Improvement[tuple[Array, float, Evaluation]]) -> FittedPoints:
         point_m, log_b, result = step.payload
@@ -121,6 +131,31 @@ def fit_steps(
         except StopIteration as stop:
             return str(stop.value)
         yield None if step is None else fitted(step)
+
+
+def patterns_of(settings: CompressionSettings, fragments: int) -> LossPatterns:
+    """Return the losses to train for: with parity, losses leave no trace on the points."""
+    return loss_patterns(0.0 if settings.parity else settings.expected_loss, fragments)
+
+
+def moved(
+    fitted: FittedPoints, position_m: Array, frame: FitFrame, settings: CompressionSettings
+) -> FittedPoints:
+    """Return the fit with its points at other positions (M, 2) and the best depths there."""
+    fragments = int(fitted.fragment.max()) + 1
+    problem = ExpectedError(
+        frame.position_m,
+        frame.depth_m,
+        frame.weight,
+        fitted.kernel,
+        patterns_of(settings, fragments),
+        fitted.fragment,
+        frame.ridge,
+    )
+    result = run(problem.steps(position_m, float(np.log(fitted.b_per_m)), gradient=False))
+    return dataclasses.replace(
+        fitted, position_m=position_m, depth_m=result.depth_m, error_m2=result.error_m2
+    )
 
 
 def _choose(
@@ -155,6 +190,7 @@ def _choose(
 _UNIT_SCALE = {Kernel.SQUARED_EXPONENTIAL: 1.0, Kernel.MATERN32: 2.0, Kernel.EXPONENTIAL: 4.0}
 
 
-def _spacing_m(point_m: Array) -> float:
+def spacing_of(point_m: Array) -> float:
+    """Return the spacing in m of the points (M, 2) if they were spread evenly."""
     span_m = np.maximum(np.ptp(point_m, axis=0), 1e-3)
     return max(float(np.sqrt(span_m[0] * span_m[1] / len(point_m))), 0.05)

@@ -3,6 +3,8 @@
 Some points go to the rim, because the leader maps only inside the hull of what it receives.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
@@ -44,6 +46,28 @@ def rim(position_m: Array, count: int) -> Array:
     chosen = np.unique(np.r_[nearest, _extremes(position_m)])
     out: Array = position_m[chosen[:count]]
     return out
+
+
+@dataclass(frozen=True, slots=True)
+class Outline:
+    """The convex outline of some positions, as half planes: normals (F, 2), offsets (F,)."""
+
+    normal: Array
+    offset_m: Array
+
+    @classmethod
+    def of(cls, position_m: Array) -> "Outline":
+        """Return the outline of positions (K, 2); without area it holds nothing back."""
+        try:
+            equations = ConvexHull(position_m).equations
+        except QhullError:
+            equations = np.empty((0, 3))
+        return cls(equations[:, :2], equations[:, 2])
+
+    def excess(self, point_m: Array) -> tuple[float, Array]:
+        """Return the sum of squared distances outside, m^2, and its gradient (M, 2)."""
+        beyond_m = np.maximum(point_m @ self.normal.T + self.offset_m, 0.0)
+        return float(np.sum(beyond_m**2)), 2.0 * beyond_m @ self.normal
 
 
 def _extremes(position_m: Array) -> NDArray[np.intp]:

@@ -1,5 +1,6 @@
 """From cells to the ten packets of the paper's profile: fit, calibrate, deal over fragments."""
 
+import dataclasses
 from collections.abc import Generator
 
 import numpy as np
@@ -7,9 +8,11 @@ from numpy.typing import NDArray
 
 from firmware.compression.binning import coarsened
 from firmware.compression.calibration import calibrated
-from firmware.compression.fit import FitFrame, FittedPoints, fit_frame, fit_steps
+from firmware.compression.fit import FitFrame, FittedPoints, fit_frame, fit_steps, moved
+from firmware.compression.fitc_fit import fitc_steps
 from firmware.compression.initial import hilbert_order
 from firmware.compression.kernels import Hyperparameters, Kernel
+from firmware.compression.mantissa import fitting_steps, flagged, with_parity, without_parity
 from firmware.compression.results import (
     PAPER_FRAGMENTS,
     PAPER_POINTS,
@@ -22,7 +25,7 @@ from firmware.submaps import BinnedSoundings
 from protocol.errors import EstimationError
 from protocol.packets import DEEPEST_M, FARTHEST_M, HIGHEST_M, Profile
 
-_CALIBRATE_EVERY = 6  # evaluations: calibration costs as much as one
+_PACK_EVERY = 8  # evaluations: calibration costs as much as one
 _FEWEST_CELLS = 3  # a hull needs a triangle
 
 
@@ -49,7 +52,8 @@ def compress_point_steps(
     best = _unfitted(cells, count)
     yield best
     frame = fit_frame(cells, settings.max_fit_rows)
-    steps = fit_steps(frame, count, PAPER_FRAGMENTS, settings)
+    fit = fitc_steps if settings.method == "fitc" else fit_steps
+    steps = fit(frame, count, PAPER_FRAGMENTS, settings)
     waiting: FittedPoints | None = None
     packed_at = 0
     while True:
@@ -61,21 +65,14 @@ def compress_point_steps(
         except EstimationError as error:  # not to be factorised at any nugget
             ended = str(error)
             break
-        if step is not None:
-            waiting = step
-            if step.evaluations >= packed_at + _CALIBRATE_EVERY or not packed_at:
-                best, packed_at, waiting = (
-                    _packed(step, frame, bins, "running"),
-                    step.evaluations,
-                    None,
-                )
-                yield best
-                continue
+        waiting = step or waiting
+        if step is not None and (not packed_at or step.evaluations >= packed_at + _PACK_EVERY):
+            packed_at, waiting = step.evaluations, None
+            best = yield from _pack_steps(step, frame, bins, best, settings)
         yield best
     if waiting is not None:
-        yield _packed(waiting, frame, bins, ended)
-    else:
-        yield _renamed(best, ended)
+        best = yield from _pack_steps(waiting, frame, bins, best, settings)
+    yield dataclasses.replace(best, report=dataclasses.replace(best.report, ended=ended))
 
 
 def usable(bins: BinnedSoundings) -> BinnedSoundings:
@@ -117,52 +114,61 @@ def _unfitted(cells: BinnedSoundings, count: int) -> CompressedPoints:
         profile=Profile.SUBMAP_PAPER,
         fragment_count=PAPER_FRAGMENTS,
         points_ned_m=dealt(points, fragment, PAPER_FRAGMENTS, PAPER_POINTS),
-        hyperparameters=hyper.to_wire(),
+        hyperparameters=np.append(hyper.to_wire()[:3], flagged(hyper.mean_depth_m, None)),
         report=FitReport(),
     )
 
 
-def _packed(
-    fitted: FittedPoints, frame: FitFrame, bins: BinnedSoundings, ended: str
-) -> CompressedPoints:
+def _pack_steps(
+    fitted: FittedPoints,
+    frame: FitFrame,
+    bins: BinnedSoundings,
+    before: CompressedPoints,
+    settings: CompressionSettings,
+) -> Generator[CompressedPoints, None, CompressedPoints]:
+    """Round, calibrate and deal a fit, yielding what was best before; the value is the new best."""
+    points = _absolute(fitted, frame)
+    steps = None
+    if settings.method != "fitc" and settings.parity and len(points) == len(before.points_ned_m):
+        steps = fitting_steps(points, frame.mean_depth_m)
+    mean_depth_m = float(flagged(frame.mean_depth_m, steps))
+    if steps is not None:
+        rounded_m = without_parity(points, steps)[:, :2] - frame.origin_m
+        fitted = moved(fitted, rounded_m, frame, settings)
+        yield before
+        points = without_parity(_absolute(fitted, frame), steps)
     hyper = Hyperparameters(
         b_per_m=fitted.b_per_m,
-        c_m2=1.0,
-        sigma2_m2=0.0,
-        mean_depth_m=frame.mean_depth_m,
+        c_m2=fitted.c_m2,
+        sigma2_m2=fitted.sigma2_m2,
+        mean_depth_m=mean_depth_m,
         kernel=fitted.kernel,
-    )
-    points = np.column_stack(
-        [fitted.position_m + frame.origin_m, fitted.depth_m + frame.mean_depth_m]
+        noise_applied=settings.noise_applied,
     )
     hyper, _ = calibrated(points, hyper, bins)
+    yield before
+    wired = dealt(points, fitted.fragment, PAPER_FRAGMENTS, PAPER_POINTS)
+    if steps is not None:
+        wired = with_parity(wired.astype(np.float64), steps)
+    hyperparameters = hyper.to_wire()
+    hyperparameters[3] = flagged(frame.mean_depth_m, steps)
     return CompressedPoints(
         profile=Profile.SUBMAP_PAPER,
         fragment_count=PAPER_FRAGMENTS,
-        points_ned_m=dealt(points, fitted.fragment, PAPER_FRAGMENTS, PAPER_POINTS),
-        hyperparameters=hyper.to_wire(),
+        points_ned_m=wired,
+        hyperparameters=hyperparameters,
         report=FitReport(
             evaluations=fitted.evaluations,
             failed_factorisations=fitted.failed_factorisations,
-            ended=ended,
+            ended="running",
             expected_rmse_m=float(np.sqrt(max(fitted.error_m2, 0.0))),
         ),
     )
 
 
-def _renamed(best: CompressedPoints, ended: str) -> CompressedPoints:
-    report = FitReport(
-        evaluations=best.report.evaluations,
-        failed_factorisations=best.report.failed_factorisations,
-        ended=ended,
-        expected_rmse_m=best.report.expected_rmse_m,
-    )
-    return CompressedPoints(
-        profile=best.profile,
-        fragment_count=best.fragment_count,
-        points_ned_m=best.points_ned_m,
-        hyperparameters=best.hyperparameters,
-        report=report,
+def _absolute(fitted: FittedPoints, frame: FitFrame) -> Array:
+    return np.column_stack(
+        [fitted.position_m + frame.origin_m, fitted.depth_m + frame.mean_depth_m]
     )
 
 

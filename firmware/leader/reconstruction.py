@@ -13,6 +13,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from firmware.compression.decoder import PointDecoder, point_decoder
 from firmware.compression.kernels import Hyperparameters
+from firmware.compression.mantissa import completed
 from firmware.geometry import Array
 from firmware.submaps import GriddedSubmap, Track
 from protocol.errors import EstimationError
@@ -40,6 +41,7 @@ class Reconstruction:
 
     grid: GriddedSubmap
     track: Track
+    recovered_points: int = 0
 
 
 def reconstruct_packets(
@@ -57,10 +59,11 @@ def reconstruct_packets(
     packets = [p for _, p in sorted(fragments.items()) if isinstance(p, SubmapPacket)]
     if not packets:
         raise EstimationError("none of the fragments holds pseudo points")
-    points_ned_m = np.concatenate([p.points_ned_m[p.usable_points] for p in packets])
+    parts = {packet.header.fragment: packet.points_ned_m for packet in packets}
+    points_ned_m, recovered = completed(parts, packets[0].hyperparameters[3])
     track = track_of_packets(packets, near_s)
     grid = reconstruct_points(points_ned_m, packets[0].hyperparameters, track, settings)
-    return Reconstruction(grid=grid, track=track)
+    return Reconstruction(grid=grid, track=track, recovered_points=recovered)
 
 
 def track_of_packets(packets: list[SubmapPacket], near_s: float) -> Track:

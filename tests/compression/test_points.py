@@ -1,5 +1,7 @@
 """The paper's profile: fit, packets, and the way back."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -64,7 +66,7 @@ def test_every_step_is_no_worse_than_the_one_before(survey: Survey) -> None:
     errors = [step.report.expected_rmse_m for step in compress_steps(survey.bins, QUICK)]
     fitted = [error for error in errors if np.isfinite(error)]
     assert len(errors) > 20
-    assert all(later <= earlier for earlier, later in zip(fitted, fitted[1:], strict=False))
+    assert all(later <= earlier for earlier, later in itertools.pairwise(fitted))
 
 
 def test_points_of_one_fragment_are_spread_over_the_whole_map(survey: Survey) -> None:

@@ -1,0 +1,78 @@
+"""The fit of the paper: positions and hyperparameters by the likelihood of Eq. (1)."""
+
+from collections.abc import Generator
+
+import numpy as np
+
+from firmware.compression.fit import FitFrame, FittedPoints, spacing_of
+from firmware.compression.fitc import Fitc, FitcEvaluation, FitcParameters
+from firmware.compression.initial import dealt_fragments, initial_points
+from firmware.compression.kernels import Kernel
+from firmware.compression.lbfgs import Trial, minimise_steps
+from firmware.compression.settings import CompressionSettings
+from firmware.geometry import Array
+
+_LOG_RANGE = 12.0  # of c and sigma^2 about the variance of depth: e^-12 of it is below any noise
+
+
+def fitc_steps(
+    frame: FitFrame, count: int, fragments: int, settings: CompressionSettings
+) -> Generator[FittedPoints | None, None, str]:
+    """Yield ever likelier fits, and None between small steps; the value says why it ended."""
+    start_m, _ = initial_points(frame.position_m, frame.depth_m, count)
+    yield None
+    spacing_m = spacing_of(start_m)
+    kernel = Kernel.SQUARED_EXPONENTIAL
+    if settings.kernel != "auto":
+        kernel = Kernel[settings.kernel.upper()]
+    problem = Fitc(frame.position_m, frame.depth_m, kernel)
+    log_c = float(np.log(max(frame.depth_m.var(), 1e-8)))
+    offset = np.array([-np.log(2.0 * spacing_m), log_c, log_c - np.log(20.0)])
+    fragment = dealt_fragments(start_m, fragments)
+
+    def parameters(x: Array) -> FitcParameters:
+        logs = offset + np.clip(x[-3:], [-3.0, -_LOG_RANGE, -_LOG_RANGE], [3.0, 3.0, 3.0])
+        return FitcParameters(
+            point_m=start_m + spacing_m * x[:-3].reshape(-1, 2),
+            log_b=float(logs[0]),
+            log_c=float(logs[1]),
+            log_sigma2=float(logs[2]),
+        )
+
+    def objective(
+        x: Array,
+    ) -> Generator[None, None, Trial[tuple[FitcParameters, FitcEvaluation]]]:
+        result = yield from problem.steps(parameters(x))
+        logs = [result.by_log_b, result.by_log_c, result.by_log_sigma2]
+        gradient = np.concatenate([spacing_m * result.by_point.ravel(), logs])
+        return Trial(value=result.value, gradient=gradient, payload=(parameters(x), result))
+
+    steps = minimise_steps(
+        objective,
+        np.zeros(2 * len(start_m) + 3),
+        evaluations=max(settings.iterations, 1),
+        first_move=0.1,
+        largest_move=0.5,
+        tolerance=1e-5,
+    )
+    while True:
+        try:
+            step = next(steps)
+        except StopIteration as stop:
+            return str(stop.value)
+        if step is None:
+            yield None
+            continue
+        found, result = step.payload
+        yield FittedPoints(
+            position_m=found.point_m,
+            depth_m=result.depth_m,
+            fragment=fragment,
+            b_per_m=float(np.exp(found.log_b)),
+            kernel=kernel,
+            error_m2=step.value,
+            evaluations=step.evaluations,
+            failed_factorisations=problem.failed_factorisations,
+            c_m2=float(np.exp(found.log_c)),
+            sigma2_m2=float(np.exp(found.log_sigma2)),
+        )

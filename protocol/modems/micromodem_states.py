@@ -124,7 +124,7 @@ TABLE: dict[tuple[State, str], Row] = {
     (State.PINGING, "CAMPR"): ("note_range", State.IDLE),
     (State.PINGING, "gone"): ("note_no_range", State.IDLE),
     (State.PINGING, "refused"): ("note_no_range", State.IDLE),
-    (State.MINI_ASKED, "CAMUC"): ("note_mini", State.IDLE),
+    (State.MINI_ASKED, "CAMUC"): ("rest", State.IDLE),
     (State.MINI_ASKED, "refused"): ("drop_mini", State.IDLE),
     (State.MINI_ASKED, "gone"): ("drop_mini", State.IDLE),
 }

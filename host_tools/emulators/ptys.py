@@ -1,0 +1,112 @@
+"""Pseudo-terminals that stand for a modem's serial port, without socat.
+
+A link in the file system keeps one name while the terminal behind it goes and comes back, as a
+port that is pulled and put back does. The speed that the host sets is read from the terminal: at
+a wrong one every byte is garbled, as on a real line.
+"""
+
+import contextlib
+import errno
+import os
+import termios
+import tty
+from pathlib import Path
+
+READ_BYTES = 65_536
+BACKLOG_BYTES = 65_536
+"""What a modem has said to a host that does not read; older bytes are lost, as on a real line."""
+
+_SPEEDS = {
+    getattr(termios, f"B{baud}"): baud
+    for baud in (300, 1200, 2400, 4800, 9600, 19_200, 38_400, 57_600, 115_200)
+}
+
+
+class PseudoPort:
+    """One end of a line whose other end any serial program opens by name."""
+
+    def __init__(self, baud: int, link: Path | None = None) -> None:
+        self.baud, self._link = baud, link
+        self._master: int | None = None
+        self._slave: int | None = None
+        self._backlog = bytearray()
+        self.lost_bytes = 0
+        self.plug()
+
+    @property
+    def name(self) -> str:
+        """What the host opens."""
+        if self._link is not None:
+            return str(self._link)
+        return "" if self._slave is None else os.ttyname(self._slave)
+
+    @property
+    def fileno(self) -> int | None:
+        """The descriptor to wait on, None while the port is pulled."""
+        return self._master
+
+    def plug(self) -> None:
+        """Make the terminal, and let the link point to it."""
+        if self._master is not None:
+            return
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        speed = next(code for code, baud in _SPEEDS.items() if baud == self.baud)
+        state = termios.tcgetattr(self._slave)
+        state[4] = state[5] = speed
+        termios.tcsetattr(self._slave, termios.TCSANOW, state)
+        if self._link is not None:
+            self._link.unlink(missing_ok=True)
+            self._link.symlink_to(os.ttyname(self._slave))
+
+    def unplug(self) -> None:
+        """Take the terminal away, as a pulled cable does; whoever has it open gets errors."""
+        for descriptor in (self._master, self._slave):
+            if descriptor is not None:
+                os.close(descriptor)
+        self._master = self._slave = None
+        self._backlog.clear()
+        if self._link is not None:
+            self._link.unlink(missing_ok=True)
+
+    def read(self) -> bytes:
+        """Return what the host has written, as heard at our speed."""
+        if self._master is None:
+            return b""
+        try:
+            return self._heard(os.read(self._master, READ_BYTES))
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            if error.errno == errno.EIO:  # the host closed its end; ours stays open
+                return b""
+            raise
+
+    def write(self, data: bytes) -> None:
+        """Say bytes to the host; what it does not read is kept up to a cap."""
+        if self._master is None:
+            self.lost_bytes += len(data)
+            return
+        self._backlog += self._heard(data)
+        excess = max(0, len(self._backlog) - BACKLOG_BYTES)
+        self.lost_bytes += excess
+        del self._backlog[:excess]
+        with contextlib.suppress(BlockingIOError):
+            while self._backlog:
+                del self._backlog[: os.write(self._master, self._backlog)]
+
+    def close(self) -> None:
+        """Take the terminal and its link away for good."""
+        self.unplug()
+
+    def _heard(self, data: bytes) -> bytes:
+        """Return data as a line of two speeds garbles it; as it is where they agree."""
+        if self._slave is None or not data:
+            return data
+        host_baud = _SPEEDS.get(termios.tcgetattr(self._slave)[5], self.baud)
+        if host_baud == self.baud:
+            return data
+        return bytes(
+            (byte * 37 ^ 0xB5) | 0x80 for byte in data[:: 2 if host_baud < self.baud else 1]
+        )

@@ -137,15 +137,12 @@ class SoundingBins:
                 self._sums[:, column] += np.bincount(rows[held], values, self._keys.size)
 
     def _noise_m(self) -> float:
-        """Return the robust spread of soundings about the median of their cell."""
-        several = self._filled >= 3
-        if not several.any():
+        """Return the robust spread of a sounding, from the first two of each cell."""
+        if self._held.shape[1] < 2 or not (self._filled >= 2).any():
             return 1.0
-        held = self._held[several]
-        with np.errstate(invalid="ignore"):
-            spread = np.abs(held - _median(held)[:, None])
-        sigma_m = _SIGMA_PER_MAD * float(np.median(spread[spread > 0])) if spread.any() else 0.0
-        return max(sigma_m if np.isfinite(sigma_m) else 0.0, _SMALLEST_SIGMA_M)
+        pairs = self._held[self._filled >= 2, :2]
+        apart_m = np.abs(pairs[:, 1] - pairs[:, 0])
+        return max(_SIGMA_PER_MAD * float(np.median(apart_m)) / np.sqrt(2.0), _SMALLEST_SIGMA_M)
 
     def _coarsen(self) -> None:
         """Double the cell; each new cell keeps the soundings first held by its parts."""

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from host_tools.capture import Captured, write_pcap
 from host_tools.commands import Command
 from protocol.codec import decode
 from protocol.errors import ConfigError, RemoteProtocolError
@@ -26,8 +27,11 @@ from protocol.packets import (
 SIZES = {int(profile): size for profile, size in SIZE_BYTES.items()}
 
 
-def inspect_file(path: Path) -> Iterator[str]:
-    """Yield one line for every frame of an air.jsonl, or of a file of frames back to back.
+def read_frames(path: Path) -> Iterator[tuple[str, Captured]]:
+    """Yield where it stands and the frame, of an air.jsonl or of a file of frames back to back.
+
+    Bytes of such a file that are no frame come as a piece of their own. Frames of a file without
+    times are given a second each.
 
     Raises
     ------
@@ -41,16 +45,32 @@ def inspect_file(path: Path) -> Iterator[str]:
     if not data:
         raise ConfigError(f"{path} is empty; give a file of frames or an air.jsonl")
     if data.lstrip()[:1] == b"{":
-        yield from _inspect_air(path, data)
+        yield from _read_air(path, data)
     else:
-        yield from _inspect_frames(data)
+        for second, (offset, piece) in enumerate(_split(data)):
+            yield f"{offset:8d}", Captured(time_s=float(second), frame=piece)
 
 
-def _inspect_air(path: Path, data: bytes) -> Iterator[str]:
+def inspect_file(path: Path) -> Iterator[str]:
+    """Yield one line for every frame of a file; raises as `read_frames` does."""
+    for place, captured in read_frames(path):
+        if captured.source is None and not _decodes(captured.frame):
+            yield f"{place}  {len(captured.frame)} bytes that are no frame"
+        else:
+            yield f"{place}  {describe(captured.frame)}"
+
+
+def _read_air(path: Path, data: bytes) -> Iterator[tuple[str, Captured]]:
     for number, line in enumerate(data.splitlines(), start=1):
         try:
             record = json.loads(line)
-            frame = bytes.fromhex(record["hex"])
+            captured = Captured(
+                time_s=float(record["t_tx_s"] if record["t_rx_s"] is None else record["t_rx_s"]),
+                frame=bytes.fromhex(record["hex"]),
+                source=int(record["source"]),
+                destination=int(record["destination"]),
+                fate=str(record["fate"]),
+            )
             head = (
                 f"{record['t_tx_s']:10.3f} s  {record['source']} -> {record['destination']}"
                 f"  {record['fate']:<11}"
@@ -59,25 +79,25 @@ def _inspect_air(path: Path, data: bytes) -> Iterator[str]:
             raise ConfigError(
                 f"{path}, line {number}: not a line of air.jsonl ({error})"
             ) from error
-        yield f"{head}  {describe(frame)}"
+        yield head, captured
 
 
-def _inspect_frames(data: bytes) -> Iterator[str]:
-    """Yield a line a frame; after damage, look for the next byte at which a frame decodes."""
-    offset = skipped = 0
+def _split(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Yield offset and frame; after damage, look for the next byte at which a frame decodes."""
+    offset = begun = 0
     while offset < len(data):
         size = SIZES.get(data[offset] & 31, 0)
         frame = data[offset : offset + size]
         if size and len(frame) == size and _decodes(frame):
-            if skipped:
-                yield f"{offset - skipped:8d}  {skipped} bytes that are no frame"
-                skipped = 0
-            yield f"{offset:8d}  {describe(frame)}"
+            if begun < offset:
+                yield begun, data[begun:offset]
+            yield offset, frame
             offset += size
+            begun = offset
         else:
-            offset, skipped = offset + 1, skipped + 1
-    if skipped:
-        yield f"{offset - skipped:8d}  {skipped} bytes that are no frame"
+            offset += 1
+    if begun < offset:
+        yield begun, data[begun:offset]
 
 
 def _decodes(frame: bytes) -> bool:
@@ -131,11 +151,36 @@ def _content(packet: Packet) -> str:
 
 def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", type=Path, metavar="FILE", help="frames back to back, or air.jsonl")
+    parser.add_argument(
+        "--pcap",
+        type=Path,
+        metavar="OUT",
+        help="write a capture for Wireshark and tshark instead (-X lua_script:fathomlink.lua)",
+    )
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    if arguments.pcap is not None:
+        print(f"{write_capture(arguments.file, arguments.pcap)} frames in {arguments.pcap}")
+        return
     for line in inspect_file(arguments.file):
         print(line)
+
+
+def write_capture(path: Path, out: Path) -> int:
+    """Write the frames of a file as a capture; return how many.
+
+    Raises
+    ------
+    ConfigError
+        As `read_frames` does, and when the capture cannot be written.
+    """
+    frames = [captured for _, captured in read_frames(path)]
+    try:
+        with out.open("wb") as stream:
+            return write_pcap(stream, frames)
+    except OSError as error:
+        raise ConfigError(f"cannot write {out}: {error.strerror}") from error
 
 
 COMMAND = Command(name="inspect", help="print what frames hold", configure=_configure, run=_run)

@@ -6,6 +6,8 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
+from threadpoolctl import threadpool_limits
+
 from host_tools import config_show, inspector
 from host_tools.commands import Command
 from protocol.errors import FathomError
@@ -43,7 +45,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one subcommand; return 0, or 2 with one line on stderr that says what is wrong."""
     parsed = build_parser().parse_args(arguments)
     try:
-        parsed.run(parsed)
+        with threadpool_limits(1):  # so that the same seed gives the same bytes
+            parsed.run(parsed)
         sys.stdout.flush()
     except FathomError as error:
         print(f"fathomlink: {' '.join(str(error).split())}", file=sys.stderr)

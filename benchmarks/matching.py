@@ -15,12 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import fft, interpolate, ndimage
+from scipy import fft, ndimage
 
+from firmware.compression import CompressionSettings, compress, fragment_points
 from firmware.geometry import Array
 from firmware.leader.matching import MatchingSettings, MatchOutcome, match
-from firmware.submaps import GriddedSubmap
+from firmware.leader.reconstruction import ReconstructionSettings, reconstruct_points
+from firmware.submaps import BinnedSoundings, GriddedSubmap, Track
 
 CELL_M = 2.0
 SPEED_MPS = 2.06
@@ -150,38 +151,34 @@ def _grid(north: Array, east: Array, depth: Array, times: Array, sigma: Array) -
     )
 
 
-def thinned(grid: GriddedSubmap, rng: np.random.Generator) -> GriddedSubmap:
-    """Return the grid rebuilt from 150 smoothed points, as after the acoustic link."""
-    known = np.isfinite(grid.depth_m)
-    mask = known.astype(float)
-    smooth = ndimage.gaussian_filter(np.where(known, grid.depth_m, 0.0), 1.0)
-    smooth = np.where(known, smooth / np.maximum(ndimage.gaussian_filter(mask, 1.0), 0.05), np.nan)
-    cells = np.argwhere(known)
-    chosen = cells[_spread(cells, 150, rng)]
-    surface = interpolate.RBFInterpolator(
-        chosen, smooth[tuple(chosen.T)], kernel="thin_plate_spline", smoothing=0.1, neighbors=30
-    )
-    depth = np.full(grid.depth_m.shape, np.nan)
-    depth[known] = surface(cells.astype(float))
-    error_m2 = np.nanvar(depth - grid.depth_m) - float(np.nanmean(grid.variance_m2))
-    variance = np.where(known, max(error_m2, 0.03**2), np.nan)
-    return GriddedSubmap(
-        north0_m=grid.north0_m,
-        east0_m=grid.east0_m,
+def rebuilt(
+    grid: GriddedSubmap, rng: np.random.Generator, loss: float, method: str
+) -> GriddedSubmap:
+    """Return the sub-map as the leader has it after the acoustic link and its losses."""
+    row, col = np.nonzero(np.isfinite(grid.depth_m))
+    variance = grid.variance_m2[row, col]
+    bins = BinnedSoundings(
         cell_m=grid.cell_m,
-        depth_m=depth,
+        north_m=grid.north0_m + grid.cell_m * row,
+        east_m=grid.east0_m + grid.cell_m * col,
+        depth_m=grid.depth_m[row, col],
         variance_m2=variance,
-        time_s=grid.time_s,
+        count=np.maximum(np.round(0.03 / variance), 1.0),
+        time_s=grid.time_s[row, col],
     )
-
-
-def _spread(cells: NDArray[np.intp], count: int, rng: np.random.Generator) -> list[int]:
-    chosen = [int(rng.integers(len(cells)))]
-    nearest = np.full(len(cells), np.inf)
-    while len(chosen) < count:
-        nearest = np.minimum(nearest, np.sum((cells - cells[chosen[-1]]) ** 2, axis=1))
-        chosen.append(int(np.argmax(nearest)))
-    return chosen
+    compressed = compress(bins, CompressionSettings(method=method))
+    arrived = rng.random(compressed.fragment_count) >= loss
+    points = fragment_points(compressed)[arrived].reshape(-1, 3)
+    seconds = np.floor(bins.time_s)
+    track_s = np.unique(seconds)
+    track = Track(
+        time_s=track_s,
+        north_m=np.array([bins.north_m[seconds == s].mean() for s in track_s]),
+        east_m=np.array([bins.east_m[seconds == s].mean() for s in track_s]),
+        yaw_rad=np.zeros(track_s.size),
+    )
+    settings = ReconstructionSettings(cell_m=grid.cell_m)
+    return reconstruct_points(points, compressed.hyperparameters, track, settings)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -193,7 +190,9 @@ class Pair:
     reconstructed: GriddedSubmap
 
 
-def make_pair(seabed: Seabed, rng: np.random.Generator, drift_sigma_mps: float) -> Pair:
+def make_pair(
+    seabed: Seabed, rng: np.random.Generator, drift_sigma_mps: float, loss: float, method: str
+) -> Pair:
     """Return two overlapping sub-maps in exact coordinates; parallel or crossing by a coin."""
     for _ in range(1000):
         centre = rng.uniform(160.0, np.array(seabed.size_m) - 160.0)
@@ -210,7 +209,7 @@ def make_pair(seabed: Seabed, rng: np.random.Generator, drift_sigma_mps: float) 
             break
     reference = survey(seabed, centre, heading, rng, drift_sigma_mps)
     query = survey(seabed, other, other_heading, rng, drift_sigma_mps)
-    return Pair(reference=reference, query=query, reconstructed=thinned(query, rng))
+    return Pair(reference=reference, query=query, reconstructed=rebuilt(query, rng, loss, method))
 
 
 def _covered(seabed: Seabed, centre: Array) -> bool:
@@ -252,11 +251,13 @@ def run(
     seed: int,
     priors_m: list[float],
     settings: MatchingSettings,
+    loss: float,
+    method: str,
 ) -> None:
     """Print a line per prior, for own sub-maps and for reconstructed ones."""
     rng = np.random.default_rng(seed)
     beds = [terrain(label)] if label in TERRAINS else [synthetic(label, rng) for _ in range(5)]
-    made = [make_pair(beds[i % len(beds)], rng, 0.02) for i in range(pairs)]
+    made = [make_pair(beds[i % len(beds)], rng, 0.02, loss, method) for i in range(pairs)]
     for prior_m in priors_m:
         for kind in ("own", "rebuilt"):
             results = []
@@ -286,13 +287,23 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--relief", default="rough,gentle,ridge,ripples,flat," + ",".join(TERRAINS))
     parser.add_argument("--prior", default="2,10,30,60")
+    parser.add_argument("--loss", type=float, default=0.14)
+    parser.add_argument("--method", default="expected", choices=["expected", "fitc"])
     arguments = parser.parse_args()
     priors_m = [float(p) for p in arguments.prior.split(",")]
     for kind in arguments.relief.split(","):
         if kind in TERRAINS and "FATHOMLINK_DATA" not in os.environ:
             print(f"{kind}: skipped, FATHOMLINK_DATA is not set")
             continue
-        run(kind, arguments.pairs, arguments.seed, priors_m, MatchingSettings())
+        run(
+            kind,
+            arguments.pairs,
+            arguments.seed,
+            priors_m,
+            MatchingSettings(),
+            arguments.loss,
+            arguments.method,
+        )
 
 
 if __name__ == "__main__":

@@ -6,7 +6,11 @@ match x is about 1, of partly unknown scale; under no match it is what it is at 
 blindly, the background b. With I the information per cell that the relief's spectrum offers
 (`relief`), the log evidence of N cells is
 
-    N I f(x) / f(1),  f(x) = log(b / max(1, x)) - x / max(1, x) + x / b  for x < b, else 0.
+    I [min(N, C) - N (1 - f(x) / f(1))],
+    f(x) = log(b / max(1, x)) - x / max(1, x) + x / b  for x < b, else 0,
+
+and never below zero. Misfit counts on all cells, but fit only on C of them: ripples go on, and more
+of the same beneath a larger overlap proves nothing new.
 
 It grows with relief and overlap, is zero on a flat seabed, and falls off as a power of E rather
 than exponentially, so that misfit which the noise model does not know cannot crown a small, lucky
@@ -31,11 +35,12 @@ class Relief:
     """What sets the scale of the evidence.
 
     background is the median of x; information_per_cell that of the relief; noise_scale how far the
-    best match exceeds the noise model, by which all others are measured too.
+    best match exceeds the noise model, by which all others are measured too; coherent_cells is C.
     """
 
     background: float
     information_per_cell: float
+    coherent_cells: float
     noise_scale: float = 1.0
 
 
@@ -83,7 +88,8 @@ def log_evidence(
     gain = np.log(limit / scale) - error / scale + error / limit
     best = max(np.log(limit) - 1.0 + 1.0 / limit, _LEAST_GAIN)
     share = np.minimum(np.maximum(gain, 0.0) / best, 1.0)
-    return np.where(usable, overlap_cells * relief.information_per_cell * share, -np.inf)
+    cells = np.minimum(overlap_cells, relief.coherent_cells) - overlap_cells * (1.0 - share)
+    return np.where(usable, np.maximum(cells, 0.0) * relief.information_per_cell, -np.inf)
 
 
 def posterior(

@@ -14,13 +14,15 @@ from firmware.leader.refinement import solve
 class Refined:
     """The optimum near one candidate.
 
-    covariance_m2 (2, 2) is of the shift between the two reference times, a kilometre along a
-    direction that the overlap says nothing about. variance_m2 is the predicted mean variance of a
+    covariance_m2 (2, 2) is of the shift, a kilometre along a direction without any information;
+    walk_m2 is to be added to each axis for the random walk of dead reckoning between the
+    overlap and the two reference times. variance_m2 is the predicted mean variance of a
     cell's difference; misfit the mean of squared normalised residuals (1 when the model holds).
     """
 
     shift_m: Array
     covariance_m2: Array
+    walk_m2: float
     depth_offset_m: float
     variance_m2: float
     misfit: float
@@ -38,12 +40,11 @@ def measure(field: Aligned, noise: NoiseModel) -> Refined:
     misfit = float(np.sum(field.weight * residual**2) / cells)
     score = _score_covariance(field, columns, residual, max(misfit, 1.0), noise)
     covariance = _sandwich(field, columns, prior, score)
-    for span in field.spans:
-        away_s = abs(span.mean_s - span.origin_s)
-        covariance = covariance + np.eye(2) * noise.walk_m2_per_s * (away_s + span.length_s / 12.0)
+    walk_s = sum(abs(s.mean_s - s.origin_s) + s.length_s / 12.0 for s in field.spans)
     return Refined(
         shift_m=field.shift_m,
         covariance_m2=covariance,
+        walk_m2=noise.walk_m2_per_s * walk_s,
         depth_offset_m=float(unknowns[2]) if noise.offset_sigma_m > 0.0 else 0.0,
         variance_m2=float(np.sum(field.variance_m2 * field.both) / cells),
         misfit=misfit,

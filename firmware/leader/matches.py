@@ -25,6 +25,9 @@ class MatchingSettings(Settings):
     minimum_overlap_m2: float = setting(
         480.0, "m^2", "the paper's N_T = 120 points of 2 m cells", minimum=0.0
     )
+    coherent_overlap_m2: float = setting(
+        4000.0, "m^2", "more overlap of like relief proves nothing new", minimum=0.0
+    )
     search_sigmas: float = setting(3.0, "", "99 % of the prior's mass", minimum=1.0)
     search_cap_m: float = setting(200.0, "m", "beyond it sub-maps do not meet", minimum=1.0)
     candidates: int = setting(200, "", "lattice shifts looked at more closely", minimum=1)
@@ -73,7 +76,7 @@ class MatchingSettings(Settings):
         1.0, "", "from simulated pairs, so that NEES is 2", minimum=0.1
     )
     slope_smoothing_cells: float = setting(
-        1.0, "cells", "keeps sounding noise out of the slopes", minimum=0.1
+        0.6, "cells", "keeps sounding noise out of the slopes", minimum=0.1
     )
 
 

@@ -121,12 +121,8 @@ def _search(problem: _Problem, times_s: tuple[float | None, float | None]) -> Ma
     candidates = _refine_best(surface, found, problem, times_s)
     if not candidates:
         return _none(NoMatch.UNSETTLED)
-    least = min(candidate.residual_m2 / candidate.noise_m2 for candidate in candidates)
-    relief = replace(
-        relief,
-        noise_scale=max(1.0, least),
-        information_per_cell=_information(problem, max(1.0, least)),
-    )
+    scale = _tolerated(min(c.residual_m2 / c.noise_m2 for c in candidates))
+    relief = replace(relief, noise_scale=scale, information_per_cell=_information(problem, scale))
     evidence = _evidence(surface, relief)
     refined = [_evidence_at(candidate, relief) for candidate in candidates]
     for candidate, value in zip(candidates, refined, strict=True):
@@ -136,6 +132,16 @@ def _search(problem: _Problem, times_s: tuple[float | None, float | None]) -> Ma
     best = int(np.argmax(scores))
     found = _posterior(surface, evidence, problem)
     return _decide(candidates[best], refined[best], found, problem)
+
+
+def _tolerated(misfit: float) -> float:
+    """Return the misfit up to which a shift counts as good as the best, whose misfit is given.
+
+    Residuals fluctuate by a tenth; where even the best fits worse than the noise allows, something
+    unmodelled with few degrees of freedom is at work (strain within a sub-map), and differences of
+    its own size mean nothing.
+    """
+    return max(misfit * (1.2 + max(misfit - 0.8, 0.0)), 0.5)
 
 
 def _evidence(surface: ErrorSurface, relief: ambiguity.Relief) -> Array:
@@ -178,7 +184,9 @@ def _relief(
     if background is None:
         return None
     return ambiguity.Relief(
-        background=background, information_per_cell=_information(problem, noise_scale=1.0)
+        background=background,
+        information_per_cell=_information(problem, noise_scale=1.0),
+        coherent_cells=problem.settings.coherent_overlap_m2 / problem.query.grid.cell_m**2,
     )
 
 
@@ -259,7 +267,11 @@ def _starts(
 def _decide(
     winner: _Candidate, evidence: float, found: ambiguity.Posterior, problem: _Problem
 ) -> MatchOutcome:
-    """Return the winner as a closure in the plane or along one axis, or the gate it failed."""
+    """Return the winner as a closure in the plane or along one axis, or the gate it failed.
+
+    Mass that is certain where neither the slopes nor the prior can be is a contradiction: chance
+    has chosen among repetitions of a pattern.
+    """
     settings, refined = problem.settings, measure(winner.field, problem.noise)
     residual, _, _ = _error(problem, refined.shift_m, absolute=settings.residual == "absolute")
     limit = settings.residual_noise_ratio * refined.variance_m2
@@ -273,11 +285,14 @@ def _decide(
     values, vectors = np.linalg.eigh(covariance)
     sigmas = np.sqrt(values)
     verdict = ambiguity.judge(found, refined.shift_m, settings.basin_m)
-    if verdict.false_mass <= settings.false_mass_limit and sigmas[1] <= settings.sigma_limit_m:
-        return _closure(refined, residual, evidence, covariance, None, verdict.false_mass)
-    if verdict.false_mass <= settings.false_mass_limit:
+    certain = verdict.false_mass <= settings.false_mass_limit
+    walk = np.eye(2) * refined.walk_m2
+    if certain and sigmas[1] <= settings.sigma_limit_m:
+        return _closure(refined, residual, evidence, covariance + walk, None, verdict.false_mass)
+    free_m = np.sqrt(vectors[:, 1] @ problem.covariance_m2 @ vectors[:, 1])
+    if certain and min(sigmas[1] / 2.0, free_m) <= settings.basin_m:
         axis, false_mass = vectors[:, 0], verdict.false_mass
-    elif verdict.false_mass_off_line <= settings.false_mass_limit:
+    elif not certain and verdict.false_mass_off_line <= settings.false_mass_limit:
         axis = np.array([np.cos(verdict.axis_rad), np.sin(verdict.axis_rad)])
         false_mass = verdict.false_mass_off_line
     else:
@@ -288,7 +303,7 @@ def _decide(
     across = np.array([-axis[1], axis[0]])
     wide = along * np.outer(axis, axis) + settings.search_cap_m**2 * np.outer(across, across)
     axis_deg = float(np.degrees(np.arctan2(axis[1], axis[0])) % 180.0)
-    return _closure(refined, residual, evidence, wide, axis_deg, false_mass)
+    return _closure(refined, residual, evidence, wide + walk, axis_deg, false_mass)
 
 
 def _closure(

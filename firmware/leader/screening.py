@@ -75,13 +75,19 @@ def prepare(
         cell_m=grid.cell_m,
         depth_m=np.where(known, grid.depth_m, np.nan)[box],
         variance_m2=np.where(known, grid.variance_m2, np.nan)[box],
-        time_s=grid.time_s[box],
+        time_s=_filled(grid.time_s[box]),
     )
     mask = known[box].astype(np.float64)
     weight = mask * np.exp(-np.nan_to_num(cropped.variance_m2)) if reconstructed else mask
     half_m2 = 0.5 * (cell_sigma_m**2 + position_sigma_m**2 * 2.0 * mean_slope2(cropped))
     noise = mask * (np.nan_to_num(cropped.variance_m2) + half_m2)
     return Layer(grid=cropped, known=mask, weight=weight, noise_m2=noise)
+
+
+def _filled(time_s: Array) -> Array:
+    """Return times with the mean where unknown: a cell whose time was lost still has a depth."""
+    known = np.isfinite(time_s)
+    return np.where(known, time_s, time_s[known].mean() if known.any() else 0.0)
 
 
 def mean_slope2(grid: GriddedSubmap) -> float:

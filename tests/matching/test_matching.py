@@ -1,0 +1,159 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from firmware.geometry import Array
+from firmware.leader.matches import count_reasons
+from firmware.leader.matching import Match, MatchingSettings, NoMatch, match
+from firmware.submaps import GriddedSubmap
+from protocol.errors import EstimationError
+from tests.matching.scenes import Scene
+
+STILL = MatchingSettings(walk_m2_per_s=0.0, drift_sigma_mps=0.0, position_sigma_m=0.1)
+
+
+def matched(
+    reference: GriddedSubmap,
+    query: GriddedSubmap,
+    prior_m: Array,
+    sigma_m: float,
+    settings: MatchingSettings = STILL,
+) -> Match:
+    outcome = match(reference, query, prior_m, np.eye(2) * sigma_m**2, settings)
+    assert outcome.match is not None, outcome.reason
+    return outcome.match
+
+
+def refused(
+    reference: GriddedSubmap,
+    query: GriddedSubmap,
+    sigma_m: float,
+    settings: MatchingSettings = STILL,
+) -> NoMatch:
+    outcome = match(reference, query, np.zeros(2), np.eye(2) * sigma_m**2, settings)
+    assert outcome.reason is not None
+    return outcome.reason
+
+
+def test_shift_is_found_below_the_cell(scene: Scene) -> None:
+    reference = scene.submap(200, 200, (41, 70))
+    query = scene.submap(180, 230, (70, 41), shift_m=(13.3, -21.7))
+    found = matched(reference, query, np.zeros(2), 30.0)
+    assert np.abs(found.shift_m - [13.3, -21.7]).max() < 0.4
+    assert found.axis_deg is None
+    assert found.false_mass < 0.01
+    assert found.residual < 0.02
+
+
+def test_strip_of_39_m_is_enough(scene: Scene) -> None:
+    reference = scene.submap(200, 100, (41, 70))
+    query = scene.submap(210, 200, (41, 70), shift_m=(5.0, 8.0))
+    found = matched(reference, query, np.array([4.0, 4.0]), 15.0)
+    assert np.abs(found.shift_m - [5.0, 8.0]).max() < 1.0
+    assert 500 < found.overlap_cells < 900
+
+
+def test_depth_offset_is_a_nuisance_unless_switched_off(scene: Scene) -> None:
+    reference = scene.submap(200, 200, (41, 70))
+    query = scene.submap(200, 220, (41, 70), offset_m=0.4)
+    found = matched(reference, query, np.zeros(2), 10.0)
+    assert found.depth_offset_m == pytest.approx(-0.4, abs=0.02)
+    assert np.abs(found.shift_m).max() < 0.4
+    absolute = dataclasses.replace(STILL, depth_offset_sigma_m=0.0, tilt_sigma=0.0)
+    absolute = dataclasses.replace(absolute, bend_sigma_per_m=0.0)
+    assert refused(reference, query, 10.0, absolute) is not None
+
+
+def test_errors_are_those_that_the_covariance_announces() -> None:
+    plain = dataclasses.replace(
+        STILL, tilt_sigma=0.0, bend_sigma_per_m=0.0, depth_offset_sigma_m=0.0, cell_sigma_m=0.001
+    )
+    nees = []
+    for seed in range(40):
+        scene = Scene(seed, rms_m=0.3)
+        reference = scene.submap(200, 100, (41, 70))
+        truth = scene.rng.uniform(-6.0, 6.0, 2)
+        query = scene.submap(210, 200, (41, 70), shift_m=(truth[0], truth[1]))
+        found = matched(reference, query, np.zeros(2), 6.0, plain)
+        error = found.shift_m - truth
+        nees.append(float(error @ np.linalg.solve(found.covariance_m2, error)))
+    assert 1.2 < np.mean(nees) < 3.0
+
+
+def level(north: Array, east: Array) -> Array:
+    return 40.0 + 0.0 * (north + east)
+
+
+def test_flat_seabed_gives_no_closure(scene: Scene) -> None:
+    flat = scene.submap(200, 200, (41, 70), relief=level)
+    other = scene.submap(200, 230, (41, 70), relief=level)
+    for sigma_m in (2.0, 20.0, 60.0):
+        assert refused(flat, other, sigma_m) is NoMatch.FEATURELESS
+
+
+def test_ridge_gives_a_closure_across_it_only(scene: Scene) -> None:
+    def ridge(north: Array, east: Array) -> Array:
+        profile = np.interp(east, np.arange(400.0), 2.0 * scene.depth_m[0])
+        return np.asarray(40.0 + profile + 0.0 * north)
+
+    reference = scene.submap(200, 200, (41, 70), relief=ridge)
+    query = scene.submap(190, 210, (70, 41), relief=ridge, shift_m=(0.0, 6.0))
+    found = matched(reference, query, np.zeros(2), 10.0)
+    assert found.axis_deg == pytest.approx(90.0, abs=5.0)
+    assert found.shift_m[1] == pytest.approx(6.0, abs=0.5)
+    assert found.covariance_m2[0, 0] > 50.0**2
+    assert found.covariance_m2[1, 1] < 1.0
+
+
+def test_ripples_are_ambiguous_when_the_prior_spans_several(scene: Scene) -> None:
+    def ripples(north: Array, east: Array) -> Array:
+        return 40.0 + 0.3 * np.sin(2.0 * np.pi * north / 14.0) * np.sin(2.0 * np.pi * east / 14.0)
+
+    reference = scene.submap(200, 200, (41, 70), relief=ripples)
+    query = scene.submap(200, 220, (41, 70), relief=ripples)
+    assert refused(reference, query, 30.0) is NoMatch.AMBIGUOUS
+    assert np.abs(matched(reference, query, np.zeros(2), 2.0).shift_m).max() < 0.5
+
+
+def test_unrelated_seabed_gives_no_closure(scene: Scene) -> None:
+    reference = scene.submap(20, 20, (41, 70))
+    query = scene.submap(250, 200, (41, 70), shift_m=(230.0, 180.0))
+    assert refused(reference, query, 30.0) in {
+        NoMatch.AMBIGUOUS,
+        NoMatch.FEATURELESS,
+        NoMatch.RESIDUAL,
+        NoMatch.UNSETTLED,
+    }
+
+
+def test_grids_that_cannot_meet_are_refused_by_name(scene: Scene) -> None:
+    reference = scene.submap(20, 20, (20, 20))
+    query = scene.submap(300, 300, (20, 20))
+    assert refused(reference, query, 5.0) is NoMatch.NO_OVERLAP
+    empty = dataclasses.replace(query, depth_m=np.full((20, 20), np.nan))
+    assert refused(reference, empty, 5.0) is NoMatch.EMPTY
+    outcome = match(reference, empty, np.zeros(2), np.eye(2), STILL)
+    assert count_reasons([outcome])[NoMatch.EMPTY] == 1
+
+
+def test_unlike_cells_and_bad_priors_are_errors(scene: Scene) -> None:
+    grid = scene.submap(20, 20, (20, 20))
+    coarse = dataclasses.replace(grid, cell_m=4.0)
+    with pytest.raises(EstimationError, match=r"4\.0 m cells"):
+        match(grid, coarse, np.zeros(2), np.eye(2), STILL)
+    with pytest.raises(EstimationError, match="not positive definite"):
+        match(grid, grid, np.zeros(2), np.diag([1.0, -1.0]), STILL)
+
+
+def test_times_carry_the_walk_into_the_covariance(scene: Scene) -> None:
+    walking = dataclasses.replace(STILL, walk_m2_per_s=0.04)
+    reference = scene.submap(200, 200, (41, 70))
+    query = scene.submap(200, 210, (41, 70))
+    own = matched(reference, query, np.zeros(2), 5.0, walking)
+    assert own.reference_time_s == pytest.approx(20.0, abs=2.0)
+    outcome = match(reference, query, np.zeros(2), np.eye(2) * 25.0, walking, times_s=(200.0, 20.0))
+    assert outcome.match is not None
+    added = outcome.match.covariance_m2 - own.covariance_m2
+    assert added[0, 0] == pytest.approx(0.04 * 180.0, rel=0.05)
+    assert outcome.match.reference_time_s == 200.0

@@ -7,7 +7,9 @@ a wrong one every byte is garbled, as on a real line.
 
 import contextlib
 import errno
+import fcntl
 import os
+import sys
 import termios
 import tty
 from pathlib import Path
@@ -30,7 +32,7 @@ class PseudoPort:
         self._master: int | None = None
         self._slave: int | None = None
         self._backlog = bytearray()
-        self.lost_bytes = 0
+        self.lost_bytes = self.written_bytes = 0
         self.plug()
 
     @property
@@ -94,7 +96,19 @@ class PseudoPort:
         del self._backlog[:excess]
         with contextlib.suppress(BlockingIOError):
             while self._backlog:
-                del self._backlog[: os.write(self._master, self._backlog)]
+                count = os.write(self._master, self._backlog)
+                self.written_bytes += count
+                del self._backlog[:count]
+
+    def waiting_bytes(self) -> tuple[int, int]:
+        """Return how many bytes the host can read now, and how many we can.
+
+        The kernel hands bytes across a pseudo-terminal a little later; a test in virtual time has
+        to wait until they are there, or the delay would count as seconds.
+        """
+        if self._slave is None or self._master is None:
+            return 0, 0
+        return _readable(self._slave), _readable(self._master)
 
     def close(self) -> None:
         """Take the terminal and its link away for good."""
@@ -107,6 +121,10 @@ class PseudoPort:
         host_baud = _SPEEDS.get(termios.tcgetattr(self._slave)[5], self.baud)
         if host_baud == self.baud:
             return data
-        return bytes(
-            (byte * 37 ^ 0xB5) | 0x80 for byte in data[:: 2 if host_baud < self.baud else 1]
-        )
+        stride = 2 if host_baud < self.baud else 1
+        return bytes((byte * 37 ^ 0xB5) & 0xFF | 0x80 for byte in data[::stride])
+
+
+def _readable(descriptor: int) -> int:
+    count = fcntl.ioctl(descriptor, termios.FIONREAD, bytes(4))
+    return int.from_bytes(count, sys.byteorder)

@@ -1,5 +1,7 @@
 """The values a sub-map is made of, from soundings to grid."""
 
+import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,6 +57,27 @@ class Submap:
     index: int
     track: Track
     bins: BinnedSoundings
+
+
+def joined(parts: Sequence[Submap]) -> Submap:
+    """Return consecutive stretches of one vehicle's survey as one sub-map, numbered as the last."""
+    bins, tracks = [part.bins for part in parts], [part.track for part in parts]
+    return dataclasses.replace(
+        parts[-1],
+        track=Track(**{f.name: _together(tracks, f.name) for f in dataclasses.fields(Track)}),
+        bins=BinnedSoundings(
+            cell_m=max(b.cell_m for b in bins),
+            **{
+                f.name: _together(bins, f.name)
+                for f in dataclasses.fields(BinnedSoundings)
+                if f.name != "cell_m"
+            },
+        ),
+    )
+
+
+def _together(values: Sequence[object], name: str) -> Array:
+    return np.concatenate([getattr(value, name) for value in values])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -144,7 +144,7 @@ class FollowerCore:
             "answers_used": self._correction.accepted,
             "answers_gated": self._correction.gated,
             "answers_stale": self._correction.stale,
-            "answers_outvoted_us": self._correction.outvoted,
+            "answers_restarted_us": self._correction.restarted,
         }
 
     def _begin_fit(self, submap: Submap) -> None:

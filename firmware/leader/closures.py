@@ -28,7 +28,7 @@ class ClosureSettings(Settings):
         48, "sub-maps", "nearest ones whose joint covariance is asked for", minimum=1
     )
     shortest_gap_s: float = setting(
-        80.0, "s", "nearer in time, dead reckoning knows more than a match", minimum=0.0
+        41.0, "s", "nearer in time, sub-maps of one vehicle share their soundings", minimum=0.0
     )
     overlap_sigmas: float = setting(
         2.0, "1", "how far beyond touching a pair may be predicted", minimum=0.0

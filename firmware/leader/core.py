@@ -4,6 +4,7 @@ The way of a sub-map: track -> nodes -> sheet -> matches (jobs, run by whoever h
 closures -> gate -> consistency -> ledger -> update -> answer.
 """
 
+import dataclasses
 import math
 from collections import Counter, deque
 from dataclasses import dataclass
@@ -25,7 +26,7 @@ from firmware.leader.tracks import TrackBuffer
 from firmware.leader.trajectory import Trajectory
 from firmware.soundings import Odometry, Ping
 from firmware.submap_builder import SubmapBuilder
-from firmware.submaps import Submap, Track
+from firmware.submaps import Submap, Track, joined
 from protocol.codec import decode, encode
 from protocol.errors import EstimationError, RemoteProtocolError
 from protocol.packets import (
@@ -90,10 +91,12 @@ class LeaderCore:
         self._builder = SubmapBuilder(
             LEADER,
             boot_epoch,
-            settings=settings.submaps,
+            settings=dataclasses.replace(settings.submaps, duration_s=settings.hop_s),
             sonar=settings.sonar,
             binning=settings.binning,
         )
+        hops = max(1, round(settings.submaps.duration_s / settings.hop_s))
+        self._stretches: deque[Submap] = deque(maxlen=hops)
         self._reassembler = Reassembler(settings.reassembly)
         self._judge = RangeJudge(settings.ranges)
         self._tracks: dict[int, TrackBuffer] = {LEADER: TrackBuffer()}
@@ -244,8 +247,11 @@ class LeaderCore:
 
     # inside
 
-    def _add_own(self, submap: Submap) -> None:
+    def _add_own(self, stretch: Submap) -> None:
+        """Join the newest stretches to a sub-map, so that one ends every hop."""
         self.graph.extend(LEADER, self.track(LEADER))
+        self._stretches.append(stretch)
+        submap = joined(list(self._stretches))
         if submap.bins.depth_m.size < self._settings.submaps.minimum_cells:
             self.counters["submaps_too_thin"] += 1
             return

@@ -4,22 +4,11 @@ Node states are (north, east, bias north, bias east); a vehicle's parameters are
 rad, log scale). Every record computes its own error, in the units of its sigmas.
 """
 
-import enum
 from dataclasses import dataclass
 
 import numpy as np
 
 from firmware.geometry import Array
-
-
-class FactorKind(enum.StrEnum):
-    """What a factor stands for."""
-
-    PRIOR = "prior"
-    ODOMETRY = "odometry"
-    CLOSURE = "closure"
-    RANGE = "range"
-    ABSOLUTE = "absolute"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,6 +44,15 @@ class OdometryRecord:
     interval_s: float
     position_sigma_m: float
     bias_sigma_mps: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SharedDriftRecord:
+    """Two vehicles in the same water: the biases of two nodes are alike to the sigma."""
+
+    origin: int
+    target: int
+    sigma_mps: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,7 +97,14 @@ class AbsoluteRecord:
     covariance_m2: Array
 
 
-Record = PriorRecord | OdometryRecord | ClosureRecord | RangeRecord | AbsoluteRecord
+Record = (
+    PriorRecord
+    | OdometryRecord
+    | SharedDriftRecord
+    | ClosureRecord
+    | RangeRecord
+    | AbsoluteRecord
+)
 
 
 @dataclass(slots=True)

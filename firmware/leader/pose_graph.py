@@ -27,6 +27,7 @@ from firmware.leader.ledger import (
     PriorRecord,
     RangeRecord,
     Record,
+    SharedDriftRecord,
 )
 from firmware.leader.trajectory import Trajectory
 from firmware.submaps import Track
@@ -35,6 +36,7 @@ from protocol.settings import Settings, setting
 
 _QUARTER_TURN = np.array([[0.0, -1.0], [1.0, 0.0]])
 _POSITION = np.eye(2, 4)  # takes a node's state to its position
+_BIAS = np.eye(2, 4, 2)  # and this to its bias
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,7 +53,10 @@ class GraphSettings(Settings):
         0.2, "m/sqrt(s)", "random part of dead reckoning: variance 0.04 a second", minimum=1e-4
     )
     bias_sigma_mps: float = setting(
-        0.2, "m/s", "unmeasured current at the start, each axis", minimum=1e-4
+        0.15, "m/s", "unmeasured current at the start, each axis", minimum=1e-4
+    )
+    bias_difference_mps: float = setting(
+        0.1, "m/s", "vehicles drift in the same water: their biases differ by less", minimum=1e-4
     )
     bias_walk: float = setting(
         0.0008, "m/s/sqrt(s)", "lets a current of 0.2 m/s turn within hours", minimum=1e-7
@@ -60,7 +65,9 @@ class GraphSettings(Settings):
         0.5, "degree", "mounting error of the attitude reference", minimum=1e-6
     )
     log_scale_sigma: float = setting(0.005, "1", "scale error of the Doppler log", minimum=1e-9)
-    range_sigma_m: float = setting(1.0, "m", "noise of a one-way range (Eq. 13)", minimum=1e-3)
+    range_sigma_m: float = setting(
+        2.0, "m", "noise of a range (1 m, Eq. 13) and of the way to its key frames", minimum=1e-3
+    )
     closure_floor_m: float = setting(
         0.4, "m", "strain within a sub-map that no match can see", minimum=0.0
     )
@@ -108,6 +115,14 @@ class PoseGraph:
         self._enter(PriorRecord(key=key, mean=state, sigmas=sigmas))
         calibration = np.array([np.radians(s.heading_bias_sigma_deg), s.log_scale_sigma])
         self._enter(PriorRecord(key=chain.parameters, mean=np.zeros(2), sigmas=calibration))
+        if number > 0:
+            first = next(iter(self._chains.values()))
+            nearest = int(np.argmin(np.abs(np.asarray(first.times_s) - time_s)))
+            self._enter(
+                SharedDriftRecord(
+                    origin=first.keys[nearest], target=key, sigma_mps=s.bias_difference_mps
+                )
+            )
 
     def vehicles(self) -> list[int]:
         """Return the vehicles that have a chain."""
@@ -361,6 +376,8 @@ def _factor(record: Record, robust_kernel: float) -> gtsam.NonlinearFactor:
             return gtsam.PriorFactorVector(record.key, record.mean, noise)
         case OdometryRecord():
             return _odometry(record)
+        case SharedDriftRecord():
+            return _shared_drift(record)
         case ClosureRecord():
             return _closure(record, _robust(record.covariance_m2, robust_kernel))
         case RangeRecord():
@@ -400,6 +417,17 @@ def _odometry(record: OdometryRecord) -> gtsam.NonlinearFactor:
         gtsam.noiseModel.Diagonal.Sigmas(sigmas),
     )
     return gtsam.LinearContainerFactor(linear, zero)
+
+
+def _shared_drift(record: SharedDriftRecord) -> gtsam.NonlinearFactor:
+    keys = [record.origin, record.target]
+
+    def error(_this: object, values: gtsam.Values, jacobians: _Jacobians) -> Array:
+        if jacobians is not None:
+            jacobians[0], jacobians[1] = -_BIAS, _BIAS
+        return np.asarray(values.atVector(keys[1])[2:] - values.atVector(keys[0])[2:])
+
+    return _custom(gtsam.noiseModel.Isotropic.Sigma(2, record.sigma_mps), keys, error)
 
 
 _Jacobians = list[Array] | None

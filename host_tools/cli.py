@@ -8,11 +8,12 @@ from typing import NoReturn
 
 from threadpoolctl import threadpool_limits
 
-from host_tools import config_show, inspector
+from host_tools import config_show, inspector, simulate
 from host_tools.commands import Command
 from protocol.errors import FathomError
 
 COMMANDS: tuple[Command, ...] = (
+    simulate.COMMAND,
     inspector.COMMAND,
     config_show.COMMAND,
 )

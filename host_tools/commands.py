@@ -70,6 +70,8 @@ def settings_of(arguments: argparse.Namespace) -> MissionSettings:
     changes = parse_changes(arguments.changes)
     if arguments.loss is not None:
         changes = {"scenario.water.loss": arguments.loss, **changes}
+    if getattr(arguments, "profile", None) is not None:
+        changes = {"follower.profile": arguments.profile, **changes}
     settings = changed(settings, changes)
     settings.scenario.check()
     return settings

@@ -73,11 +73,12 @@ def errors_over_time(result: MissionResult) -> Figure:
         for name, track_m, covariance_m2 in tracks:
             error_m = np.hypot(*(track_m - truth_m).T)
             axes.plot(minutes, np.maximum(error_m, 0.05), color=COLOURS[name], lw=1.2, label=name)
-            if covariance_m2 is not None:
+            if covariance_m2 is not None and np.isfinite(covariance_m2).any():
                 sigma_m = np.sqrt(np.trace(covariance_m2, axis1=1, axis2=2))
+                known = np.isfinite(sigma_m)
                 axes.plot(
-                    minutes,
-                    np.maximum(2.0 * sigma_m, 0.05),
+                    minutes[known],
+                    np.maximum(2.0 * sigma_m[known], 0.05),
                     color=COLOURS[name],
                     lw=0.8,
                     ls="--",

@@ -1,0 +1,114 @@
+"""`fathomlink simulate`: one mission from terrain to report."""
+
+import argparse
+import time
+from pathlib import Path
+
+from tqdm import tqdm
+
+from host_tools.collect import mission_result
+from host_tools.commands import Command, add_mission_arguments, settings_of
+from host_tools.evaluation import Evaluation, evaluate
+from host_tools.mapping import DepthMap
+from host_tools.mission import Progress, local_nodes, run, simulated_vehicles, water_between
+from host_tools.mission_settings import MissionSettings
+from host_tools.report import write_report
+from host_tools.results import MissionResult
+from host_tools.simulator.placement import place_survey
+from host_tools.simulator.terrain import open_terrain
+from host_tools.writers import prepare_folder, write_outputs
+from protocol.acoustics import Delivery
+
+
+def simulate(
+    settings: MissionSettings,
+    terrain: Path | None,
+    seed: int,
+    baseline: str = "none",
+    progress: Progress | None = None,
+) -> MissionResult:
+    """Return a whole mission, all vehicles in this process."""
+    scenario = settings.scenario
+    site = place_survey(open_terrain(terrain, scenario.relief_seed), scenario, seed)
+    truth_map = DepthMap(site.window)
+    vehicles = simulated_vehicles(settings, site, seed, truth_map.add)
+    leader, followers = local_nodes(settings, vehicles)
+    deliveries: list[Delivery] = []
+    run(
+        {0: leader, **{node.core.vehicle: node for node in followers}},
+        water_between(settings, vehicles, seed),
+        duration_s=scenario.duration_s,
+        tick_s=1.0 / scenario.ping_hz,
+        record=deliveries.append,
+        progress=progress,
+    )
+    return mission_result(
+        settings, site, seed, baseline, vehicles, leader, followers, deliveries, truth_map
+    )
+
+
+def outcome_lines(evaluation: Evaluation) -> list[str]:
+    """Return the mission's errors as a table: what is left of dead reckoning's."""
+    lines = [f"{'':<12} {'dead reckoning':>15} {'live':>18} {'final':>18} {'at the end':>11}"]
+    for name, errors in evaluation.vehicles.items():
+        live, final = errors.live, errors.final
+        lines.append(
+            f"{name:<12} {errors.dead_reckoning.mean_m:13.2f} m "
+            f"{live.mean_m:8.2f} m {live.share_of_dead_reckoning:6.1%} "
+            f"{final.mean_m:9.2f} m {final.share_of_dead_reckoning:6.1%} {final.end_m:8.2f} m"
+        )
+    error, tiles = evaluation.registration, evaluation.tiles
+    lines.append(
+        f"map against truth-navigated map: mean {error.mean_m:.3f} m, "
+        f"median {error.median_m:.3f} m, {error.share_under_1m:.1%} under 1 m; tiles shifted {tiles.median_m:.2f} m in the median"
+    )
+    return lines
+
+
+def _configure(parser: argparse.ArgumentParser) -> None:
+    add_mission_arguments(parser)
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="where the outputs go"
+    )
+    parser.add_argument("--no-report", action="store_true", help="leave report.html out")
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    settings = settings_of(arguments)
+    folder = prepare_folder(arguments.out)
+    began_s = time.perf_counter()
+    with tqdm(
+        total=round(settings.scenario.duration_s),
+        unit="s",
+        desc="mission",
+        delay=2.0,
+        leave=False,
+        disable=None,  # unless stderr is a terminal
+    ) as bar:
+        result = simulate(
+            settings,
+            arguments.terrain,
+            arguments.seed,
+            arguments.baseline,
+            lambda now_s: _advance(bar, now_s),
+        )
+    evaluation = evaluate(result)
+    write_outputs(result, evaluation, folder)
+    took_s = time.perf_counter() - began_s
+    if not arguments.no_report:
+        write_report(result, evaluation, folder / "report.html")
+    print("\n".join(outcome_lines(evaluation)))
+    print(f"{settings.scenario.duration_s / took_s:.0f} x real time; outputs in {folder}")
+
+
+def _advance(bar: "tqdm[object]", now_s: float) -> None:
+    if now_s - bar.n >= 1.0:
+        bar.update(int(now_s) - bar.n)
+
+
+COMMAND = Command(
+    name="simulate",
+    help="run a mission and write its outputs",
+    configure=_configure,
+    run=_run,
+)

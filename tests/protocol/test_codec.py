@@ -183,6 +183,9 @@ def test_what_a_profile_cannot_hold_is_a_local_error() -> None:
     )
     with pytest.raises(LocalProtocolError, match="10 bytes, not 9"):
         encode(sealed)
+    unsealed = Answer(header=sealed.header, submap=7, north_m=0.0, east_m=0.0)
+    with pytest.raises(LocalProtocolError, match="only a sealed frame"):
+        encode(unsealed)
     with pytest.raises(LocalProtocolError, match="never restamped"):
         restamp(encode(replace(sealed, body=bytes(10))), 3)
 
@@ -214,3 +217,10 @@ def test_packets_compare_by_bits_and_hash_alike() -> None:
 def test_header_fields_fill_sixty_four_bits() -> None:
     assert sum(bits for _, bits in HEADER_FIELDS) == 64
     assert {name for name, _ in HEADER_FIELDS} == {field.name for field in fields(Header)}
+
+
+@given(packets([Profile.ANSWER, Profile.ANSWER_EXTENDED]))
+def test_answers_name_their_vehicle_and_its_epoch(packet: Packet) -> None:
+    assert isinstance(packet, Answer | ExtendedAnswer)
+    assert packet.to_vehicle == packet.header.fragment
+    assert packet.to_boot_epoch == packet.header.fragment_count

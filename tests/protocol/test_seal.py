@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from protocol.codec import decode, encode
@@ -225,6 +225,7 @@ def test_marks_that_cannot_be_written_are_counted(tmp_path: Path) -> None:
     assert marks.failed_writes == 1
 
 
+@settings(max_examples=20)
 @given(st.lists(st.integers(0, 20), max_size=10))
 def test_counters_never_repeat_across_crashes(
     tmp_path_factory: pytest.TempPathFactory, uses: list[int]

@@ -3,6 +3,7 @@
 import argparse
 import time
 from pathlib import Path
+from typing import Never
 
 from tqdm import tqdm
 
@@ -60,7 +61,8 @@ def outcome_lines(evaluation: Evaluation) -> list[str]:
     error, tiles = evaluation.registration, evaluation.tiles
     lines.append(
         f"map against truth-navigated map: mean {error.mean_m:.3f} m, "
-        f"median {error.median_m:.3f} m, {error.share_under_1m:.1%} under 1 m; tiles shifted {tiles.median_m:.2f} m in the median"
+        f"median {error.median_m:.3f} m, {error.share_under_1m:.1%} under 1 m; "
+        f"tiles shifted by {tiles.median_m:.2f} m in the median"
     )
     return lines
 
@@ -101,7 +103,7 @@ def _run(arguments: argparse.Namespace) -> None:
     print(f"{settings.scenario.duration_s / took_s:.0f} x real time; outputs in {folder}")
 
 
-def _advance(bar: "tqdm[object]", now_s: float) -> None:
+def _advance(bar: "tqdm[Never]", now_s: float) -> None:
     if now_s - bar.n >= 1.0:
         bar.update(int(now_s) - bar.n)
 

@@ -116,14 +116,13 @@ def emulate(
 ) -> int:
     """Run emulated modems in real time until interrupted; return the exit status.
 
-    Time zero of the modems' pulse and of the mission is the start of this program, so hosts that
-    want one-way ranges start their clocks from the line `pulse` that is printed.
+    The modems' pulses come on this machine's whole UTC seconds, as from a GNSS receiver, so any
+    host program here whose mission clock starts on such a second gets one-way ranges.
     """
     with emulation(settings) as running, contextlib.suppress(KeyboardInterrupt):
-        zero_s = clock()
+        zero_s = clock() - time.clock_gettime(time.CLOCK_REALTIME) % 1.0
         for node, url in enumerate(running.urls(), 1):
             say(f"node {node}: {url}")
-        say(f"pulse: second 0 is {zero_s:.3f} on this machine's monotonic clock")
         while not should_stop():
             now_s = clock() - zero_s
             running.step(now_s)

@@ -11,7 +11,8 @@ from host_tools.emulators.micromodem_firmware import MicroModemQuirks
 from host_tools.emulators.nanomodem import NanomodemQuirks, NanomodemUnit
 from host_tools.emulators.rig import Rig
 from protocol.acoustics import Position, Water, WaterSettings
-from protocol.modems.micromodem import MicroModem, MicroModemSettings
+from protocol.modems.micromodem import MicroModem
+from protocol.modems.micromodem_settings import MicroModemSettings
 from protocol.modems.nanomodem import Nanomodem
 from protocol.modems.nanomodem_states import NanomodemSettings
 

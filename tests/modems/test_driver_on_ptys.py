@@ -16,7 +16,9 @@ from host_tools.emulators.run import EmulationSettings, emulate
 from protocol.errors import ConfigError, ModemError, ModemTimeout, ModemUnavailable
 from protocol.modems.base import ModemContext
 from protocol.modems.dialect_driver import DialectDriver, await_identified, check_frame_size
-from protocol.modems.micromodem import MicroModem, MicroModemSettings
+from protocol.modems.events import FrameHeard
+from protocol.modems.micromodem import MicroModem
+from protocol.modems.micromodem_settings import MicroModemSettings
 from protocol.modems.raw_log import RawLog, read_log, replay
 from protocol.modems.registry import open_modem
 from tests.modems.pairs import Pair, pair
@@ -187,7 +189,7 @@ def test_a_raw_log_replays_to_the_same_words_and_events(tmp_path: Path) -> None:
     core = MicroModem(MicroModemSettings(address=1))
     events, said, recorded = replay(read_log(io.StringIO(file.getvalue())), core)
     assert said == recorded
-    assert [e.frame for e in events if type(e).__name__ == "FrameHeard"] == heard == [b"hello"]
+    assert [e.frame for e in events if isinstance(e, FrameHeard)] == heard == [b"hello"]
     assert core.status() == status
 
 

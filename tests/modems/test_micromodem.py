@@ -19,7 +19,8 @@ from protocol.modems.events import (
     PeerSilent,
     RangeMeasured,
 )
-from protocol.modems.micromodem import MicroModem, MicroModemSettings
+from protocol.modems.micromodem import MicroModem
+from protocol.modems.micromodem_settings import MicroModemSettings
 from protocol.modems.micromodem_states import TABLE, WAITS, State
 from protocol.packets import Answer, Header, Profile
 from protocol.timestamps import one_way_travel_time_s

@@ -38,7 +38,7 @@ def transfer(submap: int, arrived: set[int]) -> SubmapTransfer:
         submap=submap,
         profile=Profile.SUBMAP_PAPER,
         fragment_count=10,
-        fragments=dict.fromkeys(arrived),  # type: ignore[misc]
+        fragments=dict.fromkeys(arrived),  # type: ignore[arg-type]
         first_arrival_s=50.0,
         last_arrival_s=90.0,
         reason="complete",

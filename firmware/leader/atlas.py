@@ -11,6 +11,9 @@ from firmware.leader.trajectory import Trajectory
 from firmware.leader.warping import remove_drift
 from firmware.submaps import GriddedSubmap, Track
 
+FOOTPRINT_M = 10.0
+"""Tiles in which footprints are compared: a tenth of a sub-map."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SheetId:
@@ -30,8 +33,8 @@ class Sheet:
     grid: GriddedSubmap
     reconstructed: bool
     time_s: float  # the middle of the measurement: the grid is warped to agree at this instant
-    centre_m: Array  # (2,) middle of the known cells, raw dead reckoning
-    radius_m: float  # half the diagonal of their extent
+    tiles_m: Array  # (P, 2) centres of the FOOTPRINT_M tiles that hold known cells
+    centre_m: Array  # (2,) middle of them, raw dead reckoning
 
     def reckoned_at(self, time_s: float) -> Array:
         """Return the vehicle's raw dead-reckoned position (2,) at the time."""
@@ -51,18 +54,32 @@ def sheet_of(
     rows, columns = np.nonzero(np.isfinite(grid.depth_m))
     if rows.size == 0:
         return None
-    origin_m = np.array([grid.north0_m, grid.east0_m])
-    low_m = origin_m + grid.cell_m * np.array([rows.min(), columns.min()])
-    high_m = origin_m + grid.cell_m * np.array([rows.max(), columns.max()])
+    known_m = np.column_stack(
+        [grid.north0_m + grid.cell_m * rows, grid.east0_m + grid.cell_m * columns]
+    )
+    tiles_m = (np.unique(np.floor(known_m / FOOTPRINT_M), axis=0) + 0.5) * FOOTPRINT_M
     return Sheet(
         id=sheet_id,
         track=track,
         grid=grid,
         reconstructed=reconstructed,
         time_s=float(np.nanmedian(grid.time_s)),
-        centre_m=(low_m + high_m) / 2,
-        radius_m=float(np.hypot(*(high_m - low_m)) / 2),
+        tiles_m=tiles_m,
+        centre_m=tiles_m.mean(axis=0),
     )
+
+
+def overlap_m2(origin: Sheet, target: Sheet, shifts_m: Array) -> Array:
+    """Return the area (S,) that two footprints share when target is moved by shifts_m (S, 2)."""
+    low = np.floor(origin.tiles_m.min(axis=0) / FOOTPRINT_M).astype(int)
+    cells = np.floor(origin.tiles_m / FOOTPRINT_M).astype(int) - low
+    occupied = np.zeros(cells.max(axis=0) + 1, dtype=bool)
+    occupied[cells[:, 0], cells[:, 1]] = True
+    moved = target.tiles_m[None] + shifts_m[:, None]
+    i, j = np.moveaxis(np.floor(moved / FOOTPRINT_M).astype(int) - low, -1, 0)
+    inside = (i >= 0) & (j >= 0) & (i < occupied.shape[0]) & (j < occupied.shape[1])
+    hit = inside & occupied[np.where(inside, i, 0), np.where(inside, j, 0)]
+    return np.asarray(FOOTPRINT_M**2 * hit.sum(axis=1))
 
 
 class Atlas:

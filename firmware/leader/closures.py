@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware.geometry import Array
-from firmware.leader.atlas import Atlas, Sheet, SheetId
+from firmware.leader.atlas import Atlas, Sheet, SheetId, overlap_m2
 from firmware.leader.ledger import Anchor
 from firmware.leader.matching import MatchingSettings, MatchOutcome, match
 from firmware.leader.pose_graph import PoseGraph
@@ -30,8 +30,8 @@ class ClosureSettings(Settings):
     shortest_gap_s: float = setting(
         41.0, "s", "nearer in time, sub-maps of one vehicle share their soundings", minimum=0.0
     )
-    overlap_sigmas: float = setting(
-        2.0, "1", "how far beyond touching a pair may be predicted", minimum=0.0
+    expected_overlap_m2: float = setting(
+        300.0, "m^2", "mean over the prior; a match needs 480 m^2", minimum=0.0
     )
     gate_chi_square: float = setting(
         13.8, "1", "99.9 % of true innovations of two components pass", minimum=1.0
@@ -99,32 +99,10 @@ def jobs_for(
     matching: MatchingSettings,
 ) -> list[MatchJob]:
     """Return the matches worth trying for a new sheet, most overlap first, bounded in number."""
-    here_m = _estimated_centre(sheet, graph)
-    others = [
-        other
-        for other in atlas
-        if other.id != sheet.id
-        and (
-            other.id.vehicle != sheet.id.vehicle
-            or abs(other.time_s - sheet.time_s) >= settings.shortest_gap_s
-        )
-    ]
-    distances_m = {o.id: float(np.hypot(*(_estimated_centre(o, graph) - here_m))) for o in others}
-    nearest = sorted(others, key=lambda o: distances_m[o.id])[: settings.screened_per_submap]
-    ranked = []
-    for other in nearest:
-        try:
-            covariance_m2 = _relative_covariance(other, sheet, graph)
-        except EstimationError:
-            continue
-        spread_m = float(np.sqrt(np.linalg.eigvalsh(covariance_m2)[-1]))
-        beyond_m = max(distances_m[other.id] - 0.8 * (sheet.radius_m + other.radius_m), 0.0)
-        if beyond_m <= settings.overlap_sigmas * spread_m + 1.0:
-            ranked.append((distances_m[other.id], other, covariance_m2))
-    ranked.sort(key=lambda item: item[0])
+    ranked = _ranked(sheet, atlas, graph, settings)
     grid, drift_mps = sheet.without_drift(graph.trajectory(sheet.id.vehicle))
     jobs = []
-    for _, other, covariance_m2 in ranked[: settings.pairs_per_submap]:
+    for other, covariance_m2 in ranked[: settings.pairs_per_submap]:
         other_grid, other_drift_mps = other.without_drift(graph.trajectory(other.id.vehicle))
         jobs.append(
             MatchJob(
@@ -210,7 +188,42 @@ def _estimated_centre(sheet: Sheet, graph: PoseGraph) -> Array:
     return sheet.centre_m + _correction(sheet, graph)
 
 
-def _relative_covariance(origin: Sheet, target: Sheet, graph: PoseGraph) -> Array:
-    anchors = [graph.anchor(s.id.vehicle, s.time_s, s.track) for s in (origin, target)]
-    between = np.hstack([-np.eye(2), np.eye(2)])
-    return np.asarray(between @ graph.covariance(anchors) @ between.T)
+def _ranked(
+    sheet: Sheet, atlas: Atlas, graph: PoseGraph, settings: ClosureSettings
+) -> list[tuple[Sheet, Array]]:
+    """Return the sheets that may overlap a new one, most first, with the offset's covariance."""
+    here_m = _estimated_centre(sheet, graph)
+    others, distances_m, anchors = [], [], [_anchor(sheet, graph)]
+    for other in atlas:
+        apart_s = abs(other.time_s - sheet.time_s)
+        if other.id == sheet.id or (
+            other.id.vehicle == sheet.id.vehicle and apart_s < settings.shortest_gap_s
+        ):
+            continue
+        others.append(other)
+        distances_m.append(float(np.hypot(*(_estimated_centre(other, graph) - here_m))))
+    nearest = np.argsort(distances_m, kind="stable")[: settings.screened_per_submap]
+    anchors += [_anchor(others[k], graph) for k in nearest]
+    joint_m2 = graph.covariance(anchors).reshape(len(anchors), 2, len(anchors), 2)
+    ranked = []
+    for position, k in enumerate(nearest, start=1):
+        cross_m2 = joint_m2[0, :, position]
+        covariance_m2 = joint_m2[0, :, 0] + joint_m2[position, :, position] - cross_m2 - cross_m2.T
+        shift_m = _correction(sheet, graph) - _correction(others[k], graph)
+        area_m2 = overlap_m2(others[k], sheet, shift_m + _spread(covariance_m2)).mean()
+        if area_m2 >= settings.expected_overlap_m2:
+            ranked.append((area_m2, others[k], covariance_m2))
+    ranked.sort(key=lambda item: -item[0])
+    return [(other, covariance_m2) for _, other, covariance_m2 in ranked]
+
+
+def _spread(covariance_m2: Array) -> Array:
+    """Return nine shifts (9, 2): none, and one and two sigmas each way along both axes."""
+    values, axes = np.linalg.eigh(covariance_m2)
+    arms_m = axes * np.sqrt(np.maximum(values, 0.0))
+    steps = np.array([[0, 0], [1, 0], [-1, 0], [2, 0], [-2, 0], [0, 1], [0, -1], [0, 2], [0, -2]])
+    return np.asarray(steps @ arms_m.T)
+
+
+def _anchor(sheet: Sheet, graph: PoseGraph) -> Anchor:
+    return graph.anchor(sheet.id.vehicle, sheet.time_s, sheet.track)

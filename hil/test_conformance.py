@@ -106,7 +106,7 @@ def test_t04_receive(open_ends: OpenEnds) -> None:
         assert ends.bench.modems[1].status().quality is not None
 
 
-def test_t05_range(open_ends: OpenEnds, record_property: Record) -> None:
+def test_t05_range(open_ends: OpenEnds, record_testsuite_property: Record) -> None:
     ends = ready(open_ends())
     if ends.bench.facts.kind == "serial":
         pytest.skip("a raw serial line measures no range")
@@ -115,7 +115,9 @@ def test_t05_range(open_ends: OpenEnds, record_property: Record) -> None:
     else:
         owtts_s = _ranges_one_way(ends)
     assert len(owtts_s) == 5
-    record_property(f"T05 {ends.bench.facts.kind} ranges_m", [round(1500 * s, 2) for s in owtts_s])
+    record_testsuite_property(
+        f"T05 {ends.bench.facts.kind} ranges_m", [round(1500 * s, 2) for s in owtts_s]
+    )
     if ends.bench.facts.range_m is not None:
         truth_s = ends.bench.facts.range_m / 1500.0
         assert max(abs(owtt_s - truth_s) for owtt_s in owtts_s) < 1e-3
@@ -143,7 +145,7 @@ def _ranges_by_ping(ends: Ends) -> list[float]:
     return [r.owtt_s for r in ends.reports[0] if isinstance(r, RangeMeasured)]
 
 
-def test_t06_loss(open_ends: OpenEnds, record_property: Record) -> None:
+def test_t06_loss(open_ends: OpenEnds, record_testsuite_property: Record) -> None:
     loss, packets = 0.14, 100
     ends = ready(open_ends(loss))
     count = 20 if ends.bench.facts.is_real else packets
@@ -154,7 +156,7 @@ def test_t06_loss(open_ends: OpenEnds, record_property: Record) -> None:
         ends.run(gap_s)
     ends.run(PACKET_S)
     numbers = [decode(event.frame).header.submap for event in ends.heard[1]]
-    record_property(f"T06 {ends.bench.facts.kind} heard", f"{len(numbers)} of {count}")
+    record_testsuite_property(f"T06 {ends.bench.facts.kind} heard", f"{len(numbers)} of {count}")
     assert numbers == sorted(set(numbers)), "every frame at most once, in order"
     assert ends.bench.modems[0].status().sent == count
     if ends.bench.facts.is_real:

@@ -48,6 +48,7 @@ class Core(Protocol):
     identified: bool
     outbox: Outbox
     frame_bytes: int
+    frames_per_packet: int
 
     @property
     def ready(self) -> bool:
@@ -104,6 +105,11 @@ class DialectDriver:
     def lead_s(self) -> float:
         """How long before its second of transmission a full packet must be handed over."""
         return self.core.lead_s
+
+    @property
+    def frames_per_packet(self) -> int:
+        """How many frames one packet takes, when they are handed over together."""
+        return self.core.frames_per_packet
 
     @property
     def verdict(self) -> str | None:

@@ -80,11 +80,11 @@ class SentenceReader:
         for part in data.replace(b"\r", b"\n").splitlines(keepends=True):
             # bytes.splitlines breaks at CR and LF only, unlike str.splitlines.
             self._line += part
-            if part.endswith(b"\n"):
-                self._finish(bytes(self._line[:-1]))
-                self._line.clear()
-            elif len(self._line) > LONGEST_BYTES:
+            if len(self._line) > LONGEST_BYTES:
                 self.damaged_count += 1
+                self._line.clear()
+            elif part.endswith(b"\n"):
+                self._finish(bytes(self._line[:-1]))
                 self._line.clear()
 
     def next_sentence(self) -> Sentence | None:

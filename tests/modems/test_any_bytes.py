@@ -26,22 +26,10 @@ SENTENCES = st.builds(
 )
 REPLIES = st.sampled_from(
     [
-        b"#A001V12345\r\n",
-        b"#A001\r\n",
-        b"$A001\r\n",
-        b"$B05\r\n",
-        b"$U00205\r\n",
-        b"$M00205\r\n",
-        b"#R002T00100\r\n",
-        b"#TO\r\n",
-        b"E\r\n",
-        b"$C3\r\n",
-        b"$C-\r\n",
-        b"#B00206V00001\r\n",
-        b"#B00205\x02\x01abc\r\n",
-        b"#U05\x02\x01abc\r\n",
-        b"#B00202\x02\x01\r\n",
-        b"#U99",
+        *(b"#A001V12345\r\n", b"#A001\r\n", b"$A001\r\n", b"$B05\r\n", b"$U00205\r\n"),
+        *(b"$M00205\r\n", b"#R002T00100\r\n", b"#TO\r\n", b"E\r\n", b"$C3\r\n", b"$C-\r\n"),
+        *(b"#B00206V00001\r\n", b"#B00205\x02\x01abc\r\n", b"#U05\x02\x01abc\r\n"),
+        *(b"#B00202\x02\x01\r\n", b"#U99"),
     ]
 )
 STEPS = st.lists(

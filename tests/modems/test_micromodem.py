@@ -294,3 +294,24 @@ def test_a_modem_power_cycled_a_hundred_times_loses_nothing_queued() -> None:
     rig.run_until(rig.now_s + 120.0)
     heard = {int.from_bytes(frame[:2], "big") for frame in frames_of(rig, 2)}
     assert heard == set(range(number))
+
+
+@pytest.mark.parametrize("range_m", [50.0, 1200.0, 2500.0])
+def test_pairs_in_8_s_slots_and_answers_between_them_share_the_air(range_m: float) -> None:
+    rig = micro_rig(range_m=range_m)
+    rig.run_until(36.0)
+    follower, leader = core_of(rig, 1), core_of(rig, 2)
+    for slot in range(5):
+        slot_s = 40.0 + 8.0 * slot
+        rig.run_until(slot_s - follower.lead_s)
+        for k in range(follower.frames_per_packet):
+            follower.send(bytes([2 * slot + k]) * 256, rig.now_s)
+        rig.run_until(slot_s + 5.0 - leader.lead_s)
+        leader.send(answer(slot), rig.now_s)
+    rig.run_until(90.0)
+    assert len(frames_of(rig, 2)) == 10
+    heard = [e for e in rig.taken(1, FrameHeard) if isinstance(e, FrameHeard)]
+    assert [decode(e.frame).header.submap for e in heard] == list(range(5))
+    assert rig.bench.fates == {"delivered": 10}
+    starts_s = [e.start_s for e in rig.taken(1, FrameSent) if isinstance(e, FrameSent)]
+    assert starts_s == [40.0 + 8.0 * (n // 2) for n in range(10)]

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from firmware.compression.binning import BinningSettings, SoundingBins
+from firmware.compression.binning import SoundingBins
+from firmware.compression.settings import BinningSettings
 from firmware.dead_reckoning import ReckonedState
 from firmware.soundings import Ping, SonarSettings, soundings_from_ping
 from firmware.submaps import Submap, Track

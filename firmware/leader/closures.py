@@ -13,7 +13,6 @@ from firmware.leader.ledger import Anchor
 from firmware.leader.matching import MatchingSettings, MatchOutcome, match
 from firmware.leader.pose_graph import PoseGraph
 from firmware.submaps import GriddedSubmap
-from protocol.errors import EstimationError
 from protocol.settings import Settings, setting
 
 
@@ -169,6 +168,14 @@ def gate(closure: Closure, graph: PoseGraph, settings: ClosureSettings) -> bool:
         active=False,
     )
     return True
+
+
+def activate(closure: Closure, graph: PoseGraph) -> None:
+    """Take a gated closure into the estimate from the next update on."""
+    if closure.number is None:
+        raise EstimationError("a closure has to be gated before it can be active")
+    closure.active = True
+    graph.set_active(closure.number, active=True)
 
 
 def count_stages(closures: Iterable[Closure]) -> dict[str, int]:

@@ -12,14 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware.belief import Belief
-from firmware.compression.settings import BinningSettings
 from firmware.dead_reckoning import DeadReckoning, ReckonedState
 from firmware.leader.atlas import Atlas, Sheet, SheetId, sheet_of
-from firmware.leader.closures import Closure, MatchJob, closure_of, gate, jobs_for
+from firmware.leader.closures import Closure, MatchJob, activate, closure_of, gate, jobs_for
 from firmware.leader.matching import MatchOutcome
 from firmware.leader.own_grid import grid_of
 from firmware.leader.pose_graph import PoseGraph
-from firmware.leader.ranges import RangeJudge
+from firmware.leader.ranging import Ranging
 from firmware.leader.reconstruction import reconstruct_packets
 from firmware.leader.settings import LeaderSettings
 from firmware.leader.tracks import TrackBuffer
@@ -40,19 +39,9 @@ from protocol.packets import (
 )
 from protocol.reassembly import FragmentArrived, Reassembler, SubmapTransfer
 from protocol.schedule import Slots
-from protocol.timestamps import from_quarters, to_quarters, to_tx_second, transmission_s
+from protocol.timestamps import from_quarters, to_quarters, to_tx_second
 
 LEADER = 0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _PendingRange:
-    """A range that waits until the sender's state at transmission is known."""
-
-    vehicle: int
-    sent_s: float
-    arrived_s: float
-    range_m: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,9 +87,8 @@ class LeaderCore:
         hops = max(1, round(settings.submaps.duration_s / settings.hop_s))
         self._stretches: deque[Submap] = deque(maxlen=hops)
         self._reassembler = Reassembler(settings.reassembly)
-        self._judge = RangeJudge(settings.ranges)
+        self._ranging = Ranging(settings.ranges)
         self._tracks: dict[int, TrackBuffer] = {LEADER: TrackBuffer()}
-        self._pending_ranges: deque[_PendingRange] = deque(maxlen=settings.pending_ranges)
         self._sheets_to_match: deque[Sheet] = deque(maxlen=16)
         self._answers: dict[int, _LatestAnswer] = {}
         self._answers_sent = 0
@@ -145,7 +133,7 @@ class LeaderCore:
             return
         self.counters["frames_received"] += 1
         if toa_s is not None:
-            self._hold_range(packet.header, toa_s)
+            self._ranging.hold(packet.header, toa_s)
 
     # what is done
 
@@ -182,8 +170,7 @@ class LeaderCore:
                     continue
                 self.closures.append(closure)
                 if gate(closure, self.graph, self._settings.closures):
-                    closure.active = True
-                    self.graph.set_active(closure.number, active=True)
+                    activate(closure, self.graph)
             except EstimationError:
                 self.counters["closures_unplaceable"] += 1
         self.graph.update()
@@ -210,11 +197,10 @@ class LeaderCore:
         """Return where the leader believes itself to be now."""
         state = self._reckoning.state
         reckoned_m = np.array([state.north_m, state.east_m])
-        trajectory = self.graph.trajectory(LEADER)
         return Belief(
             time_s=state.time_s,
-            position_m=trajectory.correct(state.time_s, reckoned_m),
-            covariance_m2=np.full((2, 2), np.nan),
+            position_m=self.graph.trajectory(LEADER).correct(state.time_s, reckoned_m),
+            covariance_m2=self.graph.predicted_covariance(LEADER, state.time_s),
         )
 
     @property
@@ -238,6 +224,7 @@ class LeaderCore:
         """Return every counter: what came, what was used, what was dropped and why."""
         return {
             **self.counters,
+            **self._ranging.counters,
             **{f"reassembly_{k}": v for k, v in _counters_of(self._reassembler).items()},
             "bad_odometry": self._reckoning.bad_samples,
             "bad_beams": self._builder.bad_beams,
@@ -295,7 +282,7 @@ class LeaderCore:
                 self.counters["states_from_the_future"] += 1
 
     def _extend(self, vehicle: int) -> None:
-        """Let a follower's chain grow by what is known of its track, and use the ranges it frees."""
+        """Let a follower's chain grow by its known track, and use the ranges that this frees."""
         buffer = self._tracks.get(vehicle)
         if buffer is None or not len(buffer):
             return
@@ -304,72 +291,8 @@ class LeaderCore:
             start_m = np.array([track.north_m[0], track.east_m[0]])
             self.graph.add_vehicle(vehicle, float(track.time_s[0]), start_m, start_m)
         self.graph.extend(vehicle, track)
-        self._use_ranges(vehicle, track)
-
-    def _hold_range(self, header: Header, toa_s: float) -> None:
-        sent_s = transmission_s(header.tx_second, toa_s)
-        if len(self._pending_ranges) == self._pending_ranges.maxlen:
-            self.counters["ranges_overwritten"] += 1
-        self._pending_ranges.append(
-            _PendingRange(
-                vehicle=header.vehicle,
-                sent_s=sent_s,
-                arrived_s=toa_s,
-                range_m=(toa_s - sent_s) * self._settings.ranges.sound_speed_mps,
-            )
-        )
-
-    def _use_ranges(self, vehicle: int, track: Track) -> None:
-        """Judge the held ranges whose both ends are known by now, as one window."""
-        end_s = float(track.time_s[-1])
-        ready = [r for r in self._pending_ranges if r.vehicle == vehicle and r.sent_s <= end_s]
-        if not ready:
-            return
         self.graph.extend(LEADER, self.track(LEADER))
-        self.graph.update()
-        for pending in ready:
-            self._pending_ranges.remove(pending)
-        ends = []
-        for pending in ready:
-            try:
-                here = self.graph.anchor(LEADER, pending.arrived_s, self.track(LEADER))
-                there = self.graph.anchor(vehicle, pending.sent_s, track)
-            except EstimationError:
-                self.counters["ranges_unplaceable"] += 1
-                continue
-            ends.append((pending, here, there))
-        if not ends:
-            return
-        between_m = [
-            self.graph.position(there) - self.graph.position(here) for _, here, there in ends
-        ]
-        predicted_m = np.array([np.hypot(*b) for b in between_m])
-        middle = len(ends) // 2
-        direction = between_m[middle] / max(predicted_m[middle], 1e-3)
-        row = np.concatenate([-direction, direction])
-        try:
-            joint_m2 = self.graph.covariance([ends[middle][1], ends[middle][2]])
-        except EstimationError:
-            self.counters["ranges_unplaceable"] += len(ends)
-            return
-        verdict = self._judge.judge(
-            np.array([pending.range_m for pending, _, _ in ends]),
-            predicted_m,
-            float(np.sqrt(max(row @ joint_m2 @ row, 1e-6))),
-        )
-        if not verdict.certain:
-            self.counters["ranges_undecided"] += len(ends)
-            return
-        factor = self._settings.ranges.outlier_factor
-        for k, (pending, here, there) in enumerate(ends):
-            if verdict.true[k]:
-                self.graph.add_range(here, there, pending.range_m)
-                self.counters["ranges_used"] += 1
-            elif verdict.stretched[k]:
-                self.graph.add_range(here, there, pending.range_m / factor)
-                self.counters["ranges_unstretched"] += 1
-            else:
-                self.counters["ranges_rejected"] += 1
+        self._ranging.use(vehicle, track, LEADER, self.track(LEADER), self.graph)
 
     def _answer(self, vehicle: int, latest: _LatestAnswer, now_s: float) -> Answer | None:
         try:

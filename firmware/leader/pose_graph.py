@@ -9,7 +9,6 @@ The ISAM2 object is a cache of the ledger: poisoned as soon as it raises, and re
 """
 
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import gtsam
@@ -18,6 +17,7 @@ from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 
 from firmware.geometry import Array
+from firmware.leader.factors import factor_of
 from firmware.leader.ledger import (
     AbsoluteRecord,
     Anchor,
@@ -33,10 +33,6 @@ from firmware.leader.trajectory import Trajectory
 from firmware.submaps import Track
 from protocol.errors import EstimationError
 from protocol.settings import Settings, setting
-
-_QUARTER_TURN = np.array([[0.0, -1.0], [1.0, 0.0]])
-_POSITION = np.eye(2, 4)  # takes a node's state to its position
-_BIAS = np.eye(2, 4, 2)  # and this to its bias
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,7 +95,8 @@ class PoseGraph:
         self._fresh = gtsam.Values()
         self._isam = _new_isam()
         self._factorised: tuple[SuperLU, dict[int, int]] | None = None
-        self._trajectories: dict[int, Trajectory] = {}  # until the next change
+        self._trajectories: dict[int, Trajectory] = {}  # both until the next change
+        self._newest_covariance: dict[int, Array] = {}
         self.rebuilds = 0
 
     def add_vehicle(self, vehicle: int, time_s: float, reckoned_m: Array, start_m: Array) -> None:
@@ -209,7 +206,7 @@ class PoseGraph:
         for number in sorted(self._changed):
             entry = self._ledger[number]
             if entry.active and entry.slot is None:
-                added.push_back(_factor(entry.record, self._settings.robust_kernel))
+                added.push_back(factor_of(entry.record, self._settings.robust_kernel))
                 numbers.append(number)
             elif not entry.active and entry.slot is not None:
                 removed.append(entry.slot)
@@ -267,6 +264,21 @@ class PoseGraph:
         unit[rows, np.arange(rows.size)] = 1.0
         return np.asarray(solver.solve(unit)[rows])
 
+    def predicted_covariance(self, vehicle: int, time_s: float) -> Array:
+        """Return the covariance (2, 2) in m^2 of a vehicle's position at or after its last node."""
+        chain, s = self._chains[vehicle], self._settings
+        if vehicle not in self._newest_covariance:
+            solver, columns = self._factorisation()
+            rows = columns[chain.keys[-1]] + np.arange(4)
+            unit = np.zeros((solver.shape[0], 4))
+            unit[rows, np.arange(4)] = 1.0
+            self._newest_covariance[vehicle] = solver.solve(unit)[rows]
+        ahead_s = max(time_s - chain.times_s[-1], 0.0)
+        carry = np.hstack([np.eye(2), -ahead_s * np.eye(2)])
+        grown_m2 = s.odometry_noise**2 * ahead_s + s.bias_walk**2 * ahead_s**3 / 3
+        covariance = self._newest_covariance[vehicle]
+        return np.asarray(carry @ covariance @ carry.T + grown_m2 * np.eye(2))
+
     def innovation(self, number: int) -> Array:
         """Return estimated minus measured offset (2,) of a closure, in metres."""
         record = self._ledger[number].record
@@ -283,6 +295,7 @@ class PoseGraph:
         chain.keys.append(key)
         self._fresh.insert(key, np.asarray(state, dtype=np.float64))
         self._trajectories.clear()
+        self._newest_covariance.clear()
         return key
 
     def _step(self, chain: _Chain, time_s: float, reckoned_m: Array) -> None:
@@ -318,7 +331,7 @@ class PoseGraph:
         graph, entries = gtsam.NonlinearFactorGraph(), []
         for entry in self._ledger:
             if entry.active:
-                graph.push_back(_factor(entry.record, self._settings.robust_kernel))
+                graph.push_back(factor_of(entry.record, self._settings.robust_kernel))
                 entries.append(entry)
         return graph, entries
 
@@ -337,6 +350,7 @@ class PoseGraph:
     def _forget_solution(self) -> None:
         self._factorised = None
         self._trajectories.clear()
+        self._newest_covariance.clear()
 
     def _factorisation(self) -> tuple[SuperLU, dict[int, int]]:
         """Return the factorised information matrix, and the first column of every variable."""
@@ -367,111 +381,3 @@ def _new_isam() -> gtsam.ISAM2:
     parameters.relinearizeSkip = 1
     parameters.findUnusedFactorSlots = True  # memory stays with what is active
     return gtsam.ISAM2(parameters)
-
-
-def _factor(record: Record, robust_kernel: float) -> gtsam.NonlinearFactor:
-    match record:
-        case PriorRecord():
-            noise = gtsam.noiseModel.Diagonal.Sigmas(record.sigmas)
-            return gtsam.PriorFactorVector(record.key, record.mean, noise)
-        case OdometryRecord():
-            return _odometry(record)
-        case SharedDriftRecord():
-            return _shared_drift(record)
-        case ClosureRecord():
-            return _closure(record, _robust(record.covariance_m2, robust_kernel))
-        case RangeRecord():
-            return _range(record, _robust(np.array([[record.sigma_m**2]]), robust_kernel))
-        case AbsoluteRecord():
-            return _absolute(record, _robust(record.covariance_m2, robust_kernel))
-
-
-def _robust(covariance: Array, robust_kernel: float) -> gtsam.noiseModel.Base:
-    return gtsam.noiseModel.Robust.Create(
-        gtsam.noiseModel.mEstimator.DCS.Create(robust_kernel),
-        gtsam.noiseModel.Gaussian.Covariance(covariance),
-    )
-
-
-def _odometry(record: OdometryRecord) -> gtsam.NonlinearFactor:
-    """Return the linear factor of OdometryRecord, stated at the origin of the state space."""
-    from_origin = -np.eye(4)
-    from_origin[:2, 2:] = record.interval_s * np.eye(2)
-    from_parameters = np.zeros((4, 2))
-    from_parameters[:2, 0] = _QUARTER_TURN @ record.moved_m
-    from_parameters[:2, 1] = record.moved_m
-    right = np.concatenate([record.moved_m, np.zeros(2)])
-    sigmas = np.repeat([record.position_sigma_m, record.bias_sigma_mps], 2)
-    zero = gtsam.Values()
-    zero.insert(record.origin, np.zeros(4))
-    zero.insert(record.target, np.zeros(4))
-    zero.insert(record.parameters, np.zeros(2))
-    linear = gtsam.JacobianFactor(
-        record.target,
-        np.eye(4),
-        record.origin,
-        from_origin,
-        record.parameters,
-        from_parameters,
-        right,
-        gtsam.noiseModel.Diagonal.Sigmas(sigmas),
-    )
-    return gtsam.LinearContainerFactor(linear, zero)
-
-
-def _shared_drift(record: SharedDriftRecord) -> gtsam.NonlinearFactor:
-    keys = [record.origin, record.target]
-
-    def error(_this: object, values: gtsam.Values, jacobians: _Jacobians) -> Array:
-        if jacobians is not None:
-            jacobians[0], jacobians[1] = -_BIAS, _BIAS
-        return np.asarray(values.atVector(keys[1])[2:] - values.atVector(keys[0])[2:])
-
-    return _custom(gtsam.noiseModel.Isotropic.Sigma(2, record.sigma_mps), keys, error)
-
-
-_Jacobians = list[Array] | None
-
-
-def _custom(
-    noise: gtsam.noiseModel.Base, keys: list[int], error: Callable[..., Array]
-) -> gtsam.NonlinearFactor:
-    return gtsam.CustomFactor(noise, keys, error)
-
-
-def _closure(record: ClosureRecord, noise: gtsam.noiseModel.Base) -> gtsam.NonlinearFactor:
-    keys = [record.origin.key, record.target.key]
-
-    def error(_this: object, values: gtsam.Values, jacobians: _Jacobians) -> Array:
-        if jacobians is not None:
-            jacobians[0], jacobians[1] = -_POSITION, _POSITION
-        return record.innovation_m(values.atVector(keys[0])[:2], values.atVector(keys[1])[:2])
-
-    return _custom(noise, keys, error)
-
-
-def _range(record: RangeRecord, noise: gtsam.noiseModel.Base) -> gtsam.NonlinearFactor:
-    keys = [record.origin.key, record.target.key]
-
-    def error(_this: object, values: gtsam.Values, jacobians: _Jacobians) -> Array:
-        miss_m, direction = record.innovation_m(
-            values.atVector(keys[0])[:2], values.atVector(keys[1])[:2]
-        )
-        if jacobians is not None:
-            towards = (direction @ _POSITION)[None, :]
-            jacobians[0], jacobians[1] = -towards, towards
-        return np.array([miss_m])
-
-    return _custom(noise, keys, error)
-
-
-def _absolute(record: AbsoluteRecord, noise: gtsam.noiseModel.Base) -> gtsam.NonlinearFactor:
-    keys = [record.anchor.key]
-
-    def error(_this: object, values: gtsam.Values, jacobians: _Jacobians) -> Array:
-        if jacobians is not None:
-            jacobians[0] = _POSITION
-        position_m = values.atVector(keys[0])[:2] + record.anchor.offset_m
-        return np.asarray(position_m - record.position_m)
-
-    return _custom(noise, keys, error)

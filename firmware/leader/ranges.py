@@ -11,6 +11,7 @@ when two explanations compete. The share of stretched ranges is learned over the
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from firmware.geometry import Array
 from protocol.settings import Settings, setting
@@ -41,6 +42,9 @@ class RangeSettings(Settings):
     longest_m: float = setting(
         10_000.0, "m", "no modem here carries farther", minimum=10.0, maximum=24_000.0
     )
+    held: int = setting(
+        256, "ranges", "waiting for their sender's track: two minutes of four followers", minimum=16
+    )
     certainty: float = setting(
         0.99, "1", "share of belief that one explanation must have", minimum=0.5, maximum=1.0
     )
@@ -50,8 +54,8 @@ class RangeSettings(Settings):
 class RangeVerdict:
     """What a window of ranges (R,) was found to be."""
 
-    true: Array  # (R,) bool
-    stretched: Array  # (R,) bool
+    true: NDArray[np.bool_]
+    stretched: NDArray[np.bool_]
     certain: bool
 
 

@@ -34,8 +34,5 @@ class LeaderSettings(Settings):
         5000, "sub-maps", "a day of two vehicles is 4,320", minimum=4, maximum=100_000
     )
     hop_s: float = setting(
-        20.0, "s", "a new own sub-map so often: they overlap, and closures come earlier", minimum=4.0
-    )
-    pending_ranges: int = setting(
-        256, "ranges", "held until the sender's track is known: two minutes of four", minimum=16
+        20.0, "s", "own sub-maps overlap by half: closures come earlier", minimum=4.0
     )

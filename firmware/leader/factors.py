@@ -1,0 +1,128 @@
+"""Records of the ledger as factors of gtsam."""
+
+from collections.abc import Callable
+
+import gtsam
+import numpy as np
+
+from firmware.geometry import Array
+from firmware.leader.ledger import (
+    AbsoluteRecord,
+    ClosureRecord,
+    OdometryRecord,
+    PriorRecord,
+    RangeRecord,
+    Record,
+    SharedDriftRecord,
+)
+
+_QUARTER_TURN = np.array([[0.0, -1.0], [1.0, 0.0]])
+_POSITION = np.eye(2, 4)  # takes a node's state to its position
+_BIAS = np.eye(2, 4, 2)  # and this to its bias
+_Jacobians = list[Array] | None
+
+
+def factor_of(record: Record, robust_kernel: float) -> gtsam.NonlinearFactor:
+    """Return the factor that gtsam makes of a record; closures and ranges are robust."""
+    match record:
+        case PriorRecord():
+            noise = gtsam.noiseModel.Diagonal.Sigmas(record.sigmas)
+            return gtsam.PriorFactorVector(record.key, record.mean, noise)
+        case OdometryRecord():
+            return _odometry(record)
+        case SharedDriftRecord():
+            return _shared_drift(record)
+        case ClosureRecord():
+            return _closure(record, _robust(record.covariance_m2, robust_kernel))
+        case RangeRecord():
+            return _range(record, _robust(np.array([[record.sigma_m**2]]), robust_kernel))
+        case AbsoluteRecord():
+            return _absolute(record, _robust(record.covariance_m2, robust_kernel))
+
+
+def _robust(covariance: Array, robust_kernel: float) -> gtsam.noiseModel.Base:
+    return gtsam.noiseModel.Robust.Create(
+        gtsam.noiseModel.mEstimator.DCS.Create(robust_kernel),
+        gtsam.noiseModel.Gaussian.Covariance(covariance),
+    )
+
+
+def _odometry(record: OdometryRecord) -> gtsam.NonlinearFactor:
+    """Return the linear factor of OdometryRecord, stated at the origin of the state space."""
+    from_origin = -np.eye(4)
+    from_origin[:2, 2:] = record.interval_s * np.eye(2)
+    from_parameters = np.zeros((4, 2))
+    from_parameters[:2, 0] = _QUARTER_TURN @ record.moved_m
+    from_parameters[:2, 1] = record.moved_m
+    right = np.concatenate([record.moved_m, np.zeros(2)])
+    sigmas = np.repeat([record.position_sigma_m, record.bias_sigma_mps], 2)
+    zero = gtsam.Values()
+    zero.insert(record.origin, np.zeros(4))
+    zero.insert(record.target, np.zeros(4))
+    zero.insert(record.parameters, np.zeros(2))
+    linear = gtsam.JacobianFactor(
+        record.target,
+        np.eye(4),
+        record.origin,
+        from_origin,
+        record.parameters,
+        from_parameters,
+        right,
+        gtsam.noiseModel.Diagonal.Sigmas(sigmas),
+    )
+    return gtsam.LinearContainerFactor(linear, zero)
+
+
+def _shared_drift(record: SharedDriftRecord) -> gtsam.NonlinearFactor:
+    keys = [record.origin, record.target]
+
+    def error(_this: object, values: gtsam.Values, jacobians: _Jacobians) -> Array:
+        if jacobians is not None:
+            jacobians[0], jacobians[1] = -_BIAS, _BIAS
+        return np.asarray(values.atVector(keys[1])[2:] - values.atVector(keys[0])[2:])
+
+    return _custom(gtsam.noiseModel.Isotropic.Sigma(2, record.sigma_mps), keys, error)
+
+
+def _custom(
+    noise: gtsam.noiseModel.Base, keys: list[int], error: Callable[..., Array]
+) -> gtsam.NonlinearFactor:
+    return gtsam.CustomFactor(noise, keys, error)
+
+
+def _closure(record: ClosureRecord, noise: gtsam.noiseModel.Base) -> gtsam.NonlinearFactor:
+    keys = [record.origin.key, record.target.key]
+
+    def error(_this: object, values: gtsam.Values, jacobians: _Jacobians) -> Array:
+        if jacobians is not None:
+            jacobians[0], jacobians[1] = -_POSITION, _POSITION
+        return record.innovation_m(values.atVector(keys[0])[:2], values.atVector(keys[1])[:2])
+
+    return _custom(noise, keys, error)
+
+
+def _range(record: RangeRecord, noise: gtsam.noiseModel.Base) -> gtsam.NonlinearFactor:
+    keys = [record.origin.key, record.target.key]
+
+    def error(_this: object, values: gtsam.Values, jacobians: _Jacobians) -> Array:
+        miss_m, direction = record.innovation_m(
+            values.atVector(keys[0])[:2], values.atVector(keys[1])[:2]
+        )
+        if jacobians is not None:
+            towards = (direction @ _POSITION)[None, :]
+            jacobians[0], jacobians[1] = -towards, towards
+        return np.array([miss_m])
+
+    return _custom(noise, keys, error)
+
+
+def _absolute(record: AbsoluteRecord, noise: gtsam.noiseModel.Base) -> gtsam.NonlinearFactor:
+    keys = [record.anchor.key]
+
+    def error(_this: object, values: gtsam.Values, jacobians: _Jacobians) -> Array:
+        if jacobians is not None:
+            jacobians[0] = _POSITION
+        position_m = values.atVector(keys[0])[:2] + record.anchor.offset_m
+        return np.asarray(position_m - record.position_m)
+
+    return _custom(noise, keys, error)

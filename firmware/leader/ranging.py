@@ -1,0 +1,114 @@
+"""One-way ranges: held until the sender's state at transmission is known, judged, then used."""
+
+from collections import Counter, deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from firmware.leader.ledger import Anchor
+from firmware.leader.pose_graph import PoseGraph
+from firmware.leader.ranges import RangeJudge, RangeSettings
+from firmware.submaps import Track
+from protocol.errors import EstimationError
+from protocol.packets import Header
+from protocol.timestamps import transmission_s
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _HeldRange:
+    """A range whose sender's track arrives only later."""
+
+    vehicle: int
+    sent_s: float
+    arrived_s: float
+    range_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _PlacedRange:
+    """A range between two anchors of the graph, with what the graph predicts for it."""
+
+    range_m: float
+    here: Anchor
+    there: Anchor
+    predicted_m: float
+    direction: np.ndarray  # (2,) unit vector from here to there
+
+
+class Ranging:
+    """Ranges in by `hold`, factors out by `use`; bounded, everything dropped is counted."""
+
+    def __init__(self, settings: RangeSettings) -> None:
+        self.counters: Counter[str] = Counter()
+        self._settings = settings
+        self._judge = RangeJudge(settings)
+        self._held: deque[_HeldRange] = deque(maxlen=settings.held)
+
+    def hold(self, header: Header, toa_s: float) -> None:
+        """Keep the range that a frame's arrival tells, until its sender's track is known."""
+        if len(self._held) == self._held.maxlen:
+            self.counters["ranges_overwritten"] += 1
+        sent_s = transmission_s(header.tx_second, toa_s)
+        self._held.append(
+            _HeldRange(
+                vehicle=header.vehicle,
+                sent_s=sent_s,
+                arrived_s=toa_s,
+                range_m=(toa_s - sent_s) * self._settings.sound_speed_mps,
+            )
+        )
+
+    def use(
+        self, vehicle: int, track: Track, receiver: int, receiver_track: Track, graph: PoseGraph
+    ) -> None:
+        """Judge, as one window, the held ranges whose both ends are known; enter the good ones."""
+        end_s = float(track.time_s[-1])
+        ready = [r for r in self._held if r.vehicle == vehicle and r.sent_s <= end_s]
+        if not ready:
+            return
+        self._held = deque((r for r in self._held if r not in ready), self._held.maxlen)
+        graph.update()
+        placed = []
+        for held in ready:
+            try:
+                here = graph.anchor(receiver, held.arrived_s, receiver_track)
+                there = graph.anchor(vehicle, held.sent_s, track)
+                placed.append(_placed(held, here, there, graph))
+            except EstimationError:
+                self.counters["ranges_unplaceable"] += 1
+        if placed:
+            self._enter(placed, graph)
+
+    def _enter(self, placed: list[_PlacedRange], graph: PoseGraph) -> None:
+        middle = placed[len(placed) // 2]
+        row = np.concatenate([-middle.direction, middle.direction])
+        variance_m2 = float(row @ graph.covariance([middle.here, middle.there]) @ row)
+        verdict = self._judge.judge(
+            np.array([p.range_m for p in placed]),
+            np.array([p.predicted_m for p in placed]),
+            float(np.sqrt(max(variance_m2, 1e-6))),
+        )
+        if not verdict.certain:
+            self.counters["ranges_undecided"] += len(placed)
+            return
+        for k, p in enumerate(placed):
+            if verdict.true[k]:
+                graph.add_range(p.here, p.there, p.range_m)
+                self.counters["ranges_used"] += 1
+            elif verdict.stretched[k]:
+                graph.add_range(p.here, p.there, p.range_m / self._settings.outlier_factor)
+                self.counters["ranges_unstretched"] += 1
+            else:
+                self.counters["ranges_rejected"] += 1
+
+
+def _placed(held: _HeldRange, here: Anchor, there: Anchor, graph: PoseGraph) -> _PlacedRange:
+    between_m = graph.position(there) - graph.position(here)
+    predicted_m = float(np.hypot(*between_m))
+    return _PlacedRange(
+        range_m=held.range_m,
+        here=here,
+        there=there,
+        predicted_m=predicted_m,
+        direction=between_m / max(predicted_m, 1e-3),
+    )

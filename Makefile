@@ -1,0 +1,52 @@
+# Every target sets up what it needs: Python 3.11 and make are enough.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/ready
+export OMP_NUM_THREADS := 1
+export OPENBLAS_NUM_THREADS := 1
+
+.PHONY: demo test slow check bench bench-compression reproduce fuzz hil wheel clean
+
+$(READY): pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --editable ".[dev]"
+	touch $@
+
+demo: $(READY)
+	$(BIN)/fathomlink demo --out out/demo
+
+test: $(READY)
+	$(BIN)/python -m pytest -m "not slow" --quiet
+
+slow: $(READY)
+	$(BIN)/python -m pytest -m slow
+
+hil: $(READY)
+	$(BIN)/python -m pytest hil
+
+check: $(READY)
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: $(READY)
+	$(BIN)/python -m benchmarks.matching
+	$(BIN)/python -m benchmarks.compression
+
+bench-compression: $(READY)
+	$(BIN)/python -m benchmarks.compression
+
+reproduce: $(READY)
+	$(BIN)/fathomlink reproduce --out out/reproduce
+
+fuzz: $(READY)
+	$(BIN)/python -m tests.fuzz.run --seconds 60
+
+wheel: $(READY)
+	sh .ci/wheel
+
+clean:
+	rm -rf $(VENV) out build dist *.egg-info

@@ -6,7 +6,8 @@ upper-case hexadecimal. Source: NMEA-0183 as the Micro-Modem speaks it.
 
 from collections import deque
 from dataclasses import dataclass
-from functools import reduce
+
+import numpy as np
 
 LONGEST_BYTES = 8_192
 """Cap of one line: a flexible packet of 2048 bytes takes 4,200 characters; twice that is noise."""
@@ -25,7 +26,7 @@ class Sentence:
 
 def checksum(body: bytes) -> int:
     """Return the exclusive or of all bytes between `$` and `*`."""
-    return reduce(lambda total, byte: total ^ byte, body, 0)
+    return int(np.bitwise_xor.reduce(np.frombuffer(body, dtype=np.uint8), initial=0))
 
 
 def encode(name: str, *fields: str | int) -> bytes:

@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 from scipy import fft, ndimage
 
-from firmware.compression import CompressionSettings, compress, fragment_points
+from firmware.compression import compress, fragment_points
+from firmware.compression.settings import CompressionSettings
 from firmware.geometry import Array
 from firmware.leader.matching import MatchingSettings, MatchOutcome, match
 from firmware.leader.reconstruction import ReconstructionSettings, reconstruct_points
@@ -159,8 +160,8 @@ def rebuilt(
     variance = grid.variance_m2[row, col]
     bins = BinnedSoundings(
         cell_m=grid.cell_m,
-        north_m=grid.north0_m + grid.cell_m * row,
-        east_m=grid.east0_m + grid.cell_m * col,
+        north_m=np.asarray(grid.north0_m + grid.cell_m * row, dtype=np.float64),
+        east_m=np.asarray(grid.east0_m + grid.cell_m * col, dtype=np.float64),
         depth_m=grid.depth_m[row, col],
         variance_m2=variance,
         count=np.maximum(np.round(0.03 / variance), 1.0),

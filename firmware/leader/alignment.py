@@ -69,7 +69,7 @@ def fields_of(layer: Layer, smoothing_cells: float) -> Array:
     smooth = ndimage.gaussian_filter(depth, smoothing_cells, mode="constant")
     smooth = np.where(share > 0.3, smooth / np.maximum(share, 0.3), np.nan)
     slopes = np.gradient(smooth, layer.grid.cell_m)
-    stack = np.stack([layer.grid.depth_m, layer.grid.variance_m2, layer.grid.time_s, *slopes])
+    stack = np.stack([layer.grid.depth_m, layer.map_m2, layer.grid.time_s, *slopes])
     return np.where(np.isfinite(stack).all(axis=0), stack, np.nan)
 
 

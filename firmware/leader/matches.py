@@ -53,11 +53,14 @@ class MatchingSettings(Settings):
     position_sigma_m: float = setting(
         0.5, "m", "heading noise and wandering inside a sub-map, felt on slopes", minimum=0.0
     )
+    finest_wave_m: float = setting(
+        17.0, "m", "twice the spacing of 150 pseudo points on a sub-map", minimum=0.1
+    )
     correlation_m: float = setting(
-        8.0, "m", "spacing of 150 pseudo points on a sub-map", minimum=0.1
+        6.0, "m", "reach of a reconstruction's errors, below the spacing of its points", minimum=0.1
     )
     correlated_share: float = setting(
-        0.5, "", "of a reconstruction's variance that neighbours share", minimum=0.0, maximum=1.0
+        0.8, "", "of a reconstruction's variance that neighbours share", minimum=0.0, maximum=1.0
     )
     basin_m: float = setting(5.0, "m", "further off a closure is called invalid", minimum=0.1)
     false_mass_limit: float = setting(
@@ -76,7 +79,7 @@ class MatchingSettings(Settings):
         1.0, "", "from simulated pairs, so that NEES is 2", minimum=0.1
     )
     slope_smoothing_cells: float = setting(
-        0.6, "cells", "keeps sounding noise out of the slopes", minimum=0.1
+        0.5, "cells", "keeps sounding noise out of the slopes", minimum=0.1
     )
 
 

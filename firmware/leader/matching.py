@@ -10,8 +10,21 @@ from firmware.leader.alignment import Aligned, NoiseModel, fields_of
 from firmware.leader.covariance import Refined, measure
 from firmware.leader.matches import Match, MatchingSettings, MatchOutcome, NoMatch
 from firmware.leader.refinement import refine
-from firmware.leader.relief import information_per_cell
-from firmware.leader.screening import ErrorSurface, Layer, error_at, error_surface, prepare
+from firmware.leader.relief import (
+    Spectrum,
+    WaveNoise,
+    fine_relief_m2,
+    information_per_cell,
+    spectrum,
+)
+from firmware.leader.screening import (
+    ErrorSurface,
+    Layer,
+    error_at,
+    error_surface,
+    mean_slope2,
+    prepare,
+)
 from firmware.submaps import GriddedSubmap
 from protocol.errors import EstimationError
 
@@ -55,39 +68,12 @@ def match(
         When the grids differ in cell size or the prior is not a covariance.
     """
     _check(reference, query, prior_covariance_m2)
-    layer_r, layer_q = (
-        prepare(
-            grid,
-            reconstructed=reconstructed,
-            cell_sigma_m=settings.cell_sigma_m,
-            position_sigma_m=settings.position_sigma_m,
-        )
-        for grid, reconstructed in (
-            (reference, reference_reconstructed),
-            (query, query_reconstructed),
-        )
-    )
+    layer_r = prepare(reference, reconstructed=reference_reconstructed)
+    layer_q = prepare(query, reconstructed=query_reconstructed)
     if layer_r is None or layer_q is None:
         return _none(NoMatch.EMPTY)
-    noise = _noise_model(settings, reconstructed=reference_reconstructed or query_reconstructed)
-    noise_m2 = _mean_noise(layer_r) + _mean_noise(layer_q)
-    shared_m2 = settings.correlated_share * (
-        reference_reconstructed * _mean_noise(layer_r) + query_reconstructed * _mean_noise(layer_q)
-    )
-    offset_m2 = settings.depth_offset_sigma_m**2
-    problem = _Problem(
-        reference=layer_r,
-        query=layer_q,
-        prior_m=np.asarray(prior_shift_m, dtype=np.float64),
-        covariance_m2=np.asarray(prior_covariance_m2, dtype=np.float64),
-        settings=settings,
-        noise=noise,
-        minimum_cells=settings.minimum_overlap_m2 / query.cell_m**2,
-        ridge_cells=noise_m2 / offset_m2 if offset_m2 > 0.0 else np.inf,
-        noise_m2=noise_m2,
-        shared_m2=shared_m2,
-    )
-    return _search(problem, times_s)
+    prior_m, covariance_m2 = np.asarray(prior_shift_m), np.asarray(prior_covariance_m2)
+    return _search(_problem(layer_r, layer_q, prior_m, covariance_m2, settings), times_s)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,8 +88,48 @@ class _Problem:
     noise: NoiseModel
     minimum_cells: float
     ridge_cells: float
-    noise_m2: float
+    spectra: tuple[Spectrum, Spectrum]
+    white_m2: float
     shared_m2: float
+
+
+def _problem(
+    reference: Layer,
+    query: Layer,
+    prior_m: Array,
+    covariance_m2: Array,
+    settings: MatchingSettings,
+) -> _Problem:
+    """Return the problem with every layer charged with its share of the noise.
+
+    A reconstruction misses the waves that are shorter than its points can carry; how high they
+    are is told by the finer of the two spectra.
+    """
+    spectra = (spectrum(reference), spectrum(query))
+    fine_m2 = max(fine_relief_m2(s, settings.finest_wave_m) for s in spectra)
+    slope2 = 0.5 * (mean_slope2(reference.grid) + mean_slope2(query.grid))
+    half_m2 = 0.5 * settings.cell_sigma_m**2 + settings.position_sigma_m**2 * slope2
+    layers = [
+        layer.charged(fine_m2 if layer.reconstructed else 0.0, half_m2)
+        for layer in (reference, query)
+    ]
+    noise_m2 = sum(_per_cell(layer.noise_m2, layer) for layer in layers)
+    rebuilt_m2 = sum(_per_cell(layer.map_m2, layer) for layer in layers if layer.reconstructed)
+    shared_m2 = settings.correlated_share * rebuilt_m2
+    offset_m2 = settings.depth_offset_sigma_m**2
+    return _Problem(
+        reference=layers[0],
+        query=layers[1],
+        prior_m=prior_m,
+        covariance_m2=covariance_m2,
+        settings=settings,
+        noise=_noise_model(settings, shared_m2 / noise_m2),
+        minimum_cells=settings.minimum_overlap_m2 / query.grid.cell_m**2,
+        ridge_cells=noise_m2 / offset_m2 if offset_m2 > 0.0 else np.inf,
+        spectra=spectra,
+        white_m2=noise_m2 - shared_m2,
+        shared_m2=shared_m2,
+    )
 
 
 def _search(problem: _Problem, times_s: tuple[float | None, float | None]) -> MatchOutcome:
@@ -192,16 +218,13 @@ def _relief(
 
 def _information(problem: _Problem, noise_scale: float) -> float:
     """Return the information per cell of the layer that has less of it."""
-    return min(
-        information_per_cell(
-            layer,
-            problem.noise_m2 * noise_scale,
-            problem.shared_m2 * noise_scale,
-            problem.settings.correlation_m,
-            problem.settings.position_sigma_m,
-        )
-        for layer in (problem.reference, problem.query)
+    noise = WaveNoise(
+        white_m2=problem.white_m2 * noise_scale,
+        shared_m2=problem.shared_m2 * noise_scale,
+        correlation_m=problem.settings.correlation_m,
+        position_sigma_m=problem.settings.position_sigma_m,
     )
+    return min(information_per_cell(relief, noise) for relief in problem.spectra)
 
 
 def _posterior(surface: ErrorSurface, evidence: Array, problem: _Problem) -> ambiguity.Posterior:
@@ -353,8 +376,8 @@ def _none(reason: NoMatch) -> MatchOutcome:
     return MatchOutcome(match=None, reason=reason)
 
 
-def _mean_noise(layer: Layer) -> float:
-    return float(layer.noise_m2.sum() / layer.known.sum())
+def _per_cell(values: Array, layer: Layer) -> float:
+    return float(values.sum() / layer.known.sum())
 
 
 def _check(reference: GriddedSubmap, query: GriddedSubmap, covariance_m2: Array) -> None:
@@ -369,7 +392,7 @@ def _check(reference: GriddedSubmap, query: GriddedSubmap, covariance_m2: Array)
         )
 
 
-def _noise_model(settings: MatchingSettings, *, reconstructed: bool) -> NoiseModel:
+def _noise_model(settings: MatchingSettings, correlated_share: float) -> NoiseModel:
     return NoiseModel(
         cell_sigma_m=settings.cell_sigma_m,
         position_sigma_m=settings.position_sigma_m,
@@ -379,5 +402,5 @@ def _noise_model(settings: MatchingSettings, *, reconstructed: bool) -> NoiseMod
         drift_sigma_mps=settings.drift_sigma_mps,
         walk_m2_per_s=settings.walk_m2_per_s,
         correlation_m=settings.correlation_m,
-        correlated_share=settings.correlated_share if reconstructed else 0.0,
+        correlated_share=correlated_share,
     )

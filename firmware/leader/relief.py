@@ -5,6 +5,8 @@ unrelated seabed by half the sum of log(S / W) over the waves whose S exceeds W.
 within a sub-map act on a wave of number k like noise of (sigma k)^2 S.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy import fft, ndimage
 
@@ -12,39 +14,67 @@ from firmware.geometry import Array
 from firmware.leader.screening import Layer
 
 _BAND = 3  # waves averaged each way: enough that noise alone never looks like relief
+_LEAST_ENERGY = 16.0  # cells under the taper; fewer have no spectrum
 
 
-def information_per_cell(
-    layer: Layer,
-    noise_m2: float,
-    shared_m2: float,
-    correlation_m: float,
-    position_sigma_m: float,
-) -> float:
-    """Return the log evidence per cell that the layer's relief offers to a perfect match.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Spectrum:
+    """Power of the relief alone, m^2 per cell, at wave numbers in rad/m; both (R, C / 2 + 1).
 
-    noise_m2 is the variance of a cell's difference, of which shared_m2 is correlated over
-    correlation_m. The spectrum is that of the tapered depths less their own noise.
+    total_cells is R C: the mean of the power over all waves is the variance of the relief.
     """
-    cell_m = layer.grid.cell_m
+
+    power_m2: Array
+    wave: Array
+    total_cells: int
+    cell_m: float
+
+    def mean(self, values: Array) -> float:
+        """Return the mean over all waves, of which half are stored."""
+        return float((2.0 * values.sum() - values[:, 0].sum()) / self.total_cells)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WaveNoise:
+    """Noise of a difference: white and correlated variance per cell, and position errors."""
+
+    white_m2: float
+    shared_m2: float
+    correlation_m: float
+    position_sigma_m: float
+
+
+def spectrum(layer: Layer) -> Spectrum:
+    """Return the spectrum of the tapered depths less their plane and the soundings' noise."""
     flat = _detrended(layer)
     rows, cols = flat.shape
     taper = np.outer(np.hanning(rows + 2)[1:-1], np.hanning(cols + 2)[1:-1]) * layer.known
     energy = float(np.sum(taper**2))
-    if energy < 16.0:
-        return 0.0
-    power = np.abs(fft.rfft2(flat * taper)) ** 2 / energy
-    power = ndimage.uniform_filter(power, _BAND, mode="nearest")
-    own_m2 = float(np.nanmean(layer.grid.variance_m2))
-    relief = np.maximum(power - own_m2, 0.0)
+    cell_m = layer.grid.cell_m
     wave = 2.0 * np.pi * np.hypot(fft.fftfreq(rows, cell_m)[:, None], fft.rfftfreq(cols, cell_m))
-    area = 2.0 * np.pi * (correlation_m / cell_m) ** 2
-    noise = noise_m2 - shared_m2 + shared_m2 * area * np.exp(-0.5 * (wave * correlation_m) ** 2)
-    noise = noise + (position_sigma_m * wave) ** 2 * relief
-    gain = 0.5 * np.log(np.maximum(relief / np.maximum(noise, 1e-12), 1.0))
-    gain[0, 0] = 0.0
-    total = 2.0 * gain.sum() - gain[:, 0].sum()  # half of the plane is stored
-    return float(total / (rows * cols))
+    power = np.zeros(wave.shape)
+    if energy >= _LEAST_ENERGY:
+        power = np.abs(fft.rfft2(flat * taper)) ** 2 / energy
+        power = ndimage.uniform_filter(power, _BAND, mode="nearest")
+        if not layer.reconstructed:
+            power = np.maximum(power - layer.map_m2.sum() / layer.known.sum(), 0.0)
+        power[0, 0] = 0.0
+    return Spectrum(power_m2=power, wave=wave, total_cells=rows * cols, cell_m=cell_m)
+
+
+def information_per_cell(relief: Spectrum, noise: WaveNoise) -> float:
+    """Return the log evidence per cell that the relief offers to a perfect match."""
+    length_m, power = noise.correlation_m, relief.power_m2
+    area = 2.0 * np.pi * (length_m / relief.cell_m) ** 2
+    total = noise.white_m2 + noise.shared_m2 * area * np.exp(-0.5 * (relief.wave * length_m) ** 2)
+    total = total + (noise.position_sigma_m * relief.wave) ** 2 * power
+    gain = 0.5 * np.log(np.maximum(power / np.maximum(total, 1e-12), 1.0))
+    return relief.mean(gain)
+
+
+def fine_relief_m2(relief: Spectrum, shortest_m: float) -> float:
+    """Return the variance of the relief in waves shorter than `shortest_m`."""
+    return relief.mean(np.where(relief.wave > 2.0 * np.pi / shortest_m, relief.power_m2, 0.0))
 
 
 def _detrended(layer: Layer) -> Array:

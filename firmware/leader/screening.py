@@ -5,6 +5,7 @@ itself, so the correlation surfaces hold Eq. (8) and (10) exactly; `error_at` ev
 sums by interpolation at any shift.
 """
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,14 +20,24 @@ class Layer:
     """A grid cropped to its known cells, ready for correlation.
 
     depth_m is zero and weight zero where nothing is known; weight is 1, or exp(-Omega) of Eq. (10)
-    when the grid is reconstructed; noise_m2 is what the grid contributes to the variance of a
-    difference, zero where unknown. All fields are (R, C).
+    when the grid is reconstructed. map_m2 is the variance of the map, noise_m2 what it contributes
+    to the variance of a difference; both zero where unknown. All fields are (R, C).
     """
 
     grid: GriddedSubmap
     known: Array
     weight: Array
+    map_m2: Array
     noise_m2: Array
+    reconstructed: bool
+
+    def charged(self, map_m2: float, difference_m2: float) -> "Layer":
+        """Return the layer with more variance of its map, and of differences besides."""
+        return dataclasses.replace(
+            self,
+            map_m2=self.map_m2 + map_m2 * self.known,
+            noise_m2=self.noise_m2 + (map_m2 + difference_m2) * self.known,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,13 +67,11 @@ class ErrorSurface:
         )
 
 
-def prepare(
-    grid: GriddedSubmap, *, reconstructed: bool, cell_sigma_m: float, position_sigma_m: float
-) -> Layer | None:
+def prepare(grid: GriddedSubmap, *, reconstructed: bool) -> Layer | None:
     """Return the grid cropped to its known cells, or None if no cell is known.
 
-    The noise of a cell is its variance, half of the squared cell_sigma_m and half of what
-    position_sigma_m makes on the mean slope: the other layer carries the other halves.
+    The variance of a reconstruction (Eq. 6) includes sigma^2 of the soundings, alike everywhere;
+    the map is better than that by its least value.
     """
     known = np.isfinite(grid.depth_m) & np.isfinite(grid.variance_m2)
     rows, cols = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
@@ -79,9 +88,16 @@ def prepare(
     )
     mask = known[box].astype(np.float64)
     weight = mask * np.exp(-np.nan_to_num(cropped.variance_m2)) if reconstructed else mask
-    half_m2 = 0.5 * (cell_sigma_m**2 + position_sigma_m**2 * 2.0 * mean_slope2(cropped))
-    noise = mask * (np.nan_to_num(cropped.variance_m2) + half_m2)
-    return Layer(grid=cropped, known=mask, weight=weight, noise_m2=noise)
+    variance = np.nan_to_num(cropped.variance_m2)
+    map_m2 = mask * (variance - np.nanmin(cropped.variance_m2) if reconstructed else variance)
+    return Layer(
+        grid=cropped,
+        known=mask,
+        weight=weight,
+        map_m2=map_m2,
+        noise_m2=map_m2,
+        reconstructed=reconstructed,
+    )
 
 
 def _filled(time_s: Array) -> Array:

@@ -10,7 +10,7 @@ from tests.matching.scenes import Scene
 
 
 def layer_of(grid: GriddedSubmap, *, reconstructed: bool = False) -> Layer:
-    layer = prepare(grid, reconstructed=reconstructed, cell_sigma_m=0.02, position_sigma_m=0.5)
+    layer = prepare(grid, reconstructed=reconstructed)
     assert layer is not None
     return layer
 
@@ -97,4 +97,4 @@ def test_absolute_norm_is_the_mean_distance(scene: Scene) -> None:
 def test_empty_grid_has_no_layer(scene: Scene) -> None:
     grid = scene.submap(100, 100, (20, 20))
     empty = dataclasses.replace(grid, depth_m=np.full((20, 20), np.nan))
-    assert prepare(empty, reconstructed=False, cell_sigma_m=0.0, position_sigma_m=0.0) is None
+    assert prepare(empty, reconstructed=False) is None

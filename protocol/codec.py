@@ -20,6 +20,7 @@ from protocol.packets import (
     POINTS_PER_FRAGMENT,
     POINTS_PER_SEALED_FRAGMENT,
     SEAL_BYTES,
+    SEALED,
     SIZE_BYTES,
     STATES_PER_FRAGMENT,
     VERSION,
@@ -40,7 +41,8 @@ _WIRE_FLOAT = np.dtype(">f4")
 _ANSWER = struct.Struct(">Hff")
 _EXTENDED_ANSWER = struct.Struct(">HffffffHH")
 _COUNTER = struct.Struct(">I")
-_PROFILES = {int(profile): profile for profile in Profile}
+_PROFILES = {int(profile): (profile, size) for profile, size in SIZE_BYTES.items()}
+_UNKNOWN = (None, 0)
 _STATE_BYTES = 12
 
 
@@ -80,7 +82,7 @@ def decode(frame: bytes) -> Packet:
             f"{size} bytes: the smallest frame has {SMALLEST_BYTES}", cause="size"
         )
     word = int.from_bytes(frame[:HEADER_BYTES], "big")
-    profile = _PROFILES.get(word >> 56 & 31)
+    profile, right_size = _PROFILES.get(word >> 56 & 31, _UNKNOWN)
     found = int.from_bytes(frame[-CRC_BYTES:], "little")
     if found != crc32c(frame[:-CRC_BYTES]):
         raise _damaged(frame, word, profile)
@@ -92,10 +94,8 @@ def decode(frame: bytes) -> Packet:
         )
     if profile is None:
         raise RemoteProtocolError(f"profile {word >> 56 & 31} is not in WIRE.md", cause="profile")
-    if size != SIZE_BYTES[profile]:
-        raise RemoteProtocolError(
-            f"{size} bytes: {profile.name} has {SIZE_BYTES[profile]}", cause="size"
-        )
+    if size != right_size:
+        raise RemoteProtocolError(f"{size} bytes: {profile.name} has {right_size}", cause="size")
     return _read(_header(word, profile), frame)
 
 
@@ -171,19 +171,19 @@ def decode_body(header: Header, body: bytes) -> Packet:
         For a fragment outside its count, reserved bytes that are not zero, and an answer whose
         position is not finite or whose variance is negative or NaN (infinite means unknown).
     """
-    plain = header.profile.plain
-    if plain is Profile.ANSWER:
+    plain = header.profile & ~SEALED
+    if plain == Profile.ANSWER:
         return _answer(header, body)
-    if plain is Profile.ANSWER_EXTENDED:
+    if plain == Profile.ANSWER_EXTENDED:
         return _extended_answer(header, body)
     if header.fragment >= header.fragment_count:
         raise RemoteProtocolError(
             f"fragment {header.fragment} of {header.fragment_count} in submap {header.submap}"
         )
+    if plain == Profile.SUBMAP_PAPER:
+        return _submap(header, body)
     if plain in OPAQUE:
         return SubmapFragment(header=header, body=body)
-    if plain is Profile.SUBMAP_PAPER:
-        return _submap(header, body)
     return _trajectory(header, body)
 
 

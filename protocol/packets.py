@@ -86,7 +86,9 @@ SIZE_BYTES: dict[Profile, int] = {
 }
 """Of the whole frame; a frame of any other size is rejected."""
 
-OPAQUE = frozenset({Profile.SUBMAP_DENSE, Profile.SUBMAP_LATTICE, Profile.SUBMAP_LATTICE_SMALL})
+OPAQUE: frozenset[int] = frozenset(
+    {Profile.SUBMAP_DENSE, Profile.SUBMAP_LATTICE, Profile.SUBMAP_LATTICE_SMALL}
+)
 """Profiles whose body only `firmware.compression` reads."""
 
 STATES_PER_FRAGMENT = 4

@@ -35,7 +35,7 @@ class EmulationSettings:
     nodes: int = 2
     range_m: float = 500.0
     seed: int = 1
-    water: WaterSettings = WaterSettings(outlier_share=0.0)  # noqa: RUF009  frozen
+    water: WaterSettings = WaterSettings(outlier_share=0.0)
     directory: Path | None = None
 
 

@@ -61,7 +61,7 @@ def drive(core: Core, steps: list[tuple[bytes, float]], stride: int) -> list[str
     return seen
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(STEPS, st.integers(1, 9))
 def test_micromodem_takes_anything_and_chunks_do_not_matter(
     steps: list[tuple[bytes, float]], stride: int
@@ -70,7 +70,7 @@ def test_micromodem_takes_anything_and_chunks_do_not_matter(
     assert drive(MicroModem(MicroModemSettings()), steps, stride) == whole
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(STEPS, st.integers(1, 9))
 def test_nanomodem_takes_anything_and_chunks_do_not_matter(
     steps: list[tuple[bytes, float]], stride: int

@@ -165,8 +165,7 @@ def test_port_pulled_and_modem_power_cycled_a_hundred_times(kind: str, tmp_path:
             both.run(25.0)
         both.run(60.0)
         missing = set(sent) - set(both.frames(1))
-        # A Nanomodem that loses power while a packet sounds cannot tell: that is lost in the water.
-        assert len(missing) <= (0 if kind == "micromodem" else 10)
+        assert missing == set()
         assert both.drivers[0].status().queued == 0
         assert both.drivers[0].status().dropped_out == 0
         assert both.drivers[0].status().reopened == 50

@@ -71,8 +71,55 @@ def _next_in_raster(now_s: float, period_s: float, offset_s: float) -> float:
     return offset_s + period_s * turns
 
 
-def reach_m(
-    slot_s: float, frame_bytes: int, rate_bps: float, sound_speed_mps: float = 1500.0
-) -> float:
-    """Return the distance within which a frame has passed entirely before its slot ends."""
-    return (slot_s - 8.0 * frame_bytes / rate_bps) * sound_speed_mps
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Air:
+    """What the guard times follow from: sizes, rate and speed of sound."""
+
+    frame_bytes: int = 256
+    answer_bytes: int = 22
+    rate_bps: float = 1000.0
+    sound_speed_mps: float = 1500.0
+
+    @property
+    def frame_s(self) -> float:
+        """Airtime of a follower's frame."""
+        return 8.0 * self.frame_bytes / self.rate_bps
+
+    @property
+    def answer_s(self) -> float:
+        """Airtime of the leader's answer."""
+        return 8.0 * self.answer_bytes / self.rate_bps
+
+
+def conflict_free_reach_m(settings: SlotSettings, air: Air) -> float:
+    """Return the distance up to which these slots cannot collide, whatever the geometry.
+
+    Within it a follower's frame has passed the leader before the leader answers and before the next
+    follower's frame, and the answer has passed all followers before any of them transmits.
+    """
+    slot_s = settings.follower_slot_s
+    starts_s = (
+        offset_s + turn * settings.leader_period_s
+        for offset_s in settings.leader_offsets_s
+        for turn in range(slot_s)  # after slot_s periods the two rasters repeat
+    )
+    guards_s = [slot_s - air.frame_s]
+    for phase_s in {start_s % slot_s for start_s in starts_s}:
+        guards_s += [phase_s - air.frame_s, slot_s - phase_s - air.answer_s]
+    return max(0.0, min(guards_s)) * air.sound_speed_mps
+
+
+def planned_slots(followers: int, reach_m: float, air: Air) -> SlotSettings:
+    """Return the shortest slots of whole seconds that cannot collide within a distance.
+
+    The leader answers in two of every five slots, as in the paper, after the frame has passed.
+    """
+    travel_s = reach_m / air.sound_speed_mps
+    phase_s = math.ceil(air.frame_s + travel_s)
+    slot_s = math.ceil(phase_s + air.answer_s + travel_s)
+    return SlotSettings(
+        followers=followers,
+        follower_slot_s=slot_s,
+        leader_period_s=5 * slot_s,
+        leader_offsets_s=(phase_s, phase_s + 2 * slot_s),
+    )

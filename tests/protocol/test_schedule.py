@@ -1,11 +1,13 @@
 """Slots and the header's short times."""
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from protocol.acoustics import Water, WaterSettings
 from protocol.errors import ConfigError
-from protocol.schedule import Slots, SlotSettings, reach_m
+from protocol.schedule import Air, Slots, SlotSettings, conflict_free_reach_m, planned_slots
 from protocol.timestamps import (
     from_quarters,
     one_way_travel_time_s,
@@ -48,8 +50,47 @@ def test_slots_that_cannot_be_are_refused() -> None:
         Slots(SlotSettings(followers=2)).next_slot_s(3, 0.0)
 
 
-def test_a_full_frame_has_passed_within_its_slot_to_nearly_three_kilometres() -> None:
-    assert reach_m(4.0, 256, 1000.0) == pytest.approx(2928.0)
+def test_the_papers_slots_are_free_of_conflict_to_twelve_hundred_metres() -> None:
+    assert conflict_free_reach_m(SlotSettings(), Air()) == pytest.approx(1236.0)
+
+
+@given(st.integers(1, 8), st.floats(100.0, 10_000.0), st.sampled_from([22, 42, 54]))
+def test_planned_slots_reach_as_far_as_asked(
+    followers: int, reach_m: float, answer_bytes: int
+) -> None:
+    air = Air(answer_bytes=answer_bytes)
+    slots = planned_slots(followers, reach_m, air)
+    assert conflict_free_reach_m(slots, air) >= reach_m - 1e-6
+
+
+def test_slots_of_leader_and_follower_at_the_same_second_have_no_reach() -> None:
+    slots = SlotSettings(leader_offsets_s=(4,))
+    assert conflict_free_reach_m(slots, Air()) == 0.0
+
+
+@pytest.mark.parametrize(("share_of_reach", "is_clear"), [(0.999, True), (1.2, False)])
+def test_four_followers_on_the_water_keep_clear_within_the_reach_and_not_beyond(
+    share_of_reach: float, is_clear: bool
+) -> None:
+    settings, air = SlotSettings(followers=4), Air()
+    radius_m = share_of_reach * conflict_free_reach_m(settings, air)
+    places = [(0.0, 0.0, 0.0), (radius_m, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, radius_m, 0.0)]
+    places.append((0.0, -1.0, 0.0))
+    quiet = WaterSettings(loss=0.0, outlier_share=0.0, range_noise_m=0.0)
+    water = Water(quiet, np.random.default_rng(1), lambda node, _: places[node], range(5))
+    slots = Slots(settings)
+    for second in range(400):
+        for vehicle in range(5):
+            if slots.next_slot_s(vehicle, float(second)) == second:
+                size = air.frame_bytes if vehicle else air.answer_bytes
+                water.transmit(vehicle, float(second), bytes(size))
+    to_leader_or_from_it = [
+        delivery.fate == "delivered"
+        for delivery in water.deliveries_until(np.inf)
+        if 0 in {delivery.source, delivery.destination}
+    ]
+    assert len(to_leader_or_from_it) == 100 + 4 * 40
+    assert all(to_leader_or_from_it) == is_clear
 
 
 @given(st.integers(0, 10**8), st.floats(-100_000.0, 100_000.0))

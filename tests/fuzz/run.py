@@ -1,13 +1,18 @@
-"""Fuzz one target with atheris: python -m tests.fuzz.run TARGET [SECONDS]; needs the fuzz extra.
+"""Fuzz with atheris: python -m tests.fuzz.run [TARGET] [--seconds 60]; without target, all in turn.
 
 Starts from tests/fuzz/corpus/TARGET; what libFuzzer adds goes to out/fuzz/TARGET. An input that
 fails is left there as crash-*; put it into the corpus once mended, and it is tested for ever.
 """
 
+import argparse
+import subprocess
 import sys
 from pathlib import Path
 
-import atheris  # type: ignore[import-not-found,import-untyped,unused-ignore]
+try:
+    import atheris  # type: ignore[import-not-found,import-untyped,unused-ignore]
+except ImportError:
+    sys.exit("fuzzing needs atheris; type: pip install -e '.[fuzz]'")
 
 with atheris.instrument_imports(include=["protocol"]):
     from tests.fuzz.targets import TARGETS
@@ -18,13 +23,23 @@ SLOWEST_S, LARGEST_MEMORY_MB = 5, 1024
 """Beyond these an input counts as a hang or as growth."""
 
 
-def main(arguments: list[str]) -> None:
-    """Run until the time is over or an input fails."""
-    if not arguments or arguments[0] not in TARGETS:
-        sys.exit(f"name a target: {', '.join(TARGETS)}")
-    name = arguments[0]
-    seconds = int(arguments[1]) if len(arguments) > 1 else 60
-    found = Path("out") / "fuzz" / name
+def main(arguments: list[str]) -> int:
+    """Run one target until the time is over or an input fails, or all of them; return the status."""
+    parser = argparse.ArgumentParser(prog="python -m tests.fuzz.run", description=__doc__)
+    parser.add_argument("target", nargs="?", choices=sorted(TARGETS))
+    parser.add_argument("--seconds", type=int, default=60, help="for each target")
+    options = parser.parse_args(arguments)
+    if options.target is not None:
+        fuzz(options.target, options.seconds)
+        return 0
+    command = [sys.executable, "-m", "tests.fuzz.run", "--seconds", str(options.seconds)]
+    done = [subprocess.run([*command, target], check=False).returncode for target in TARGETS]
+    return max(map(abs, done))
+
+
+def fuzz(target: str, seconds: int) -> None:
+    """Fuzz one target; libFuzzer ends the process itself."""
+    found = Path("out") / "fuzz" / target
     found.mkdir(parents=True, exist_ok=True)
     options = [
         f"-max_total_time={seconds}",
@@ -34,11 +49,11 @@ def main(arguments: list[str]) -> None:
         f"-artifact_prefix={found}/",
         "-print_final_stats=1",
         str(found),
-        str(CORPUS / name),
+        str(CORPUS / target),
     ]
-    atheris.Setup([sys.argv[0], *options], TARGETS[name])
+    atheris.Setup([sys.argv[0], *options], TARGETS[target])
     atheris.Fuzz()
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(main(sys.argv[1:]))

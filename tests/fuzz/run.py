@@ -24,7 +24,7 @@ SLOWEST_S, LARGEST_MEMORY_MB = 5, 1024
 
 
 def main(arguments: list[str]) -> int:
-    """Run one target until the time is over or an input fails, or all of them; return the status."""
+    """Run one target, or all, until the time is over or an input fails; return the status."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz.run", description=__doc__)
     parser.add_argument("target", nargs="?", choices=sorted(TARGETS))
     parser.add_argument("--seconds", type=int, default=60, help="for each target")

@@ -2,16 +2,27 @@
 
 from collections.abc import Iterator
 
+import numpy as np
+
+from firmware.compression.dense import dense_code_steps
+from firmware.compression.lattice import lattice_code_steps
 from firmware.compression.packing import packets_from
-from firmware.compression.points import compress_point_steps
-from firmware.compression.results import CompressedPoints, FitReport, fragment_points
+from firmware.compression.points import compress_point_steps, unfitted, usable
+from firmware.compression.results import (
+    CompressedCode,
+    CompressedPoints,
+    FitReport,
+    fragment_points,
+)
 from firmware.compression.settings import CompressionSettings
 from firmware.submaps import BinnedSoundings
+from protocol.packets import BODY_BYTES, Profile
 
-Compressed = CompressedPoints
+Compressed = CompressedPoints | CompressedCode
 
 __all__ = [
     "Compressed",
+    "CompressedCode",
     "CompressedPoints",
     "FitReport",
     "compress",
@@ -22,13 +33,72 @@ __all__ = [
 
 
 def compress_steps(
-    bins: BinnedSoundings, settings: CompressionSettings | None = None
+    bins: BinnedSoundings,
+    settings: CompressionSettings | None = None,
+    profile: str = "paper",
 ) -> Iterator[Compressed]:
-    """Yield the best compressed sub-map so far after each small step; the last is the result."""
-    return compress_point_steps(bins, settings or CompressionSettings())
+    """Yield the best compressed sub-map so far after each small step; the last is the result.
+
+    The first comes at once, as cells in packets of the paper's profile, so that there is always
+    something to send; profile is `paper`, `dense` or `lattice`.
+    """
+    settings = settings or CompressionSettings()
+    if profile == "lattice":
+        return _lattice_steps(bins, settings)
+    if profile == "dense":
+        return _dense_steps(bins, settings)
+    return compress_point_steps(bins, settings)
 
 
-def compress(bins: BinnedSoundings, settings: CompressionSettings | None = None) -> Compressed:
+def compress(
+    bins: BinnedSoundings,
+    settings: CompressionSettings | None = None,
+    profile: str = "paper",
+) -> Compressed:
     """Return the compressed sub-map, fitted to the end of its budget."""
-    *_, best = compress_steps(bins, settings)
+    *_, best = compress_steps(bins, settings, profile)
     return best
+
+
+def _lattice_steps(bins: BinnedSoundings, settings: CompressionSettings) -> Iterator[Compressed]:
+    bins = usable(bins)
+    first = unfitted(bins, settings)
+    profile = Profile.SUBMAP_LATTICE_SMALL if settings.small_frames else Profile.SUBMAP_LATTICE
+    steps = lattice_code_steps(bins, settings.lattice_step_m, settings.frames * BODY_BYTES[profile])
+    while True:
+        try:
+            next(steps)
+        except StopIteration as stop:
+            code = stop.value
+            break
+        yield first
+    yield CompressedCode(
+        profile=profile,
+        fragment_count=settings.frames,
+        code=code,
+        settings=settings,
+        report=FitReport(evaluations=1, ended="converged"),
+    )
+
+
+def _dense_steps(bins: BinnedSoundings, settings: CompressionSettings) -> Iterator[Compressed]:
+    bins = usable(bins)
+    best: Compressed = unfitted(bins, settings)
+    yield best
+    size = BODY_BYTES[Profile.SUBMAP_DENSE]
+    for step in dense_code_steps(bins, settings, size):
+        if step is not None:
+            code, fitted = step
+            best = CompressedCode(
+                profile=Profile.SUBMAP_DENSE,
+                fragment_count=settings.frames,
+                code=code,
+                settings=settings,
+                report=FitReport(
+                    evaluations=fitted.evaluations,
+                    failed_factorisations=fitted.failed_factorisations,
+                    ended="running",
+                    expected_rmse_m=float(np.sqrt(max(fitted.error_m2, 0.0))),
+                ),
+            )
+        yield best

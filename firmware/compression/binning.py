@@ -142,7 +142,8 @@ class SoundingBins:
             return 1.0
         pairs = self._held[self._filled >= 2, :2]
         apart_m = np.abs(pairs[:, 1] - pairs[:, 0])
-        return max(_SIGMA_PER_MAD * float(np.median(apart_m)) / np.sqrt(2.0), _SMALLEST_SIGMA_M)
+        sigma_m = _SIGMA_PER_MAD * float(np.median(apart_m)) / float(np.sqrt(2.0))
+        return max(sigma_m, _SMALLEST_SIGMA_M)
 
     def _coarsen(self) -> None:
         """Double the cell; each new cell keeps the soundings first held by its parts."""

@@ -38,7 +38,7 @@ def calibrated(
     residual_m = bins.depth_m[::every] - depth_m
     squared = spread + residual_m**2
     c, sigma2 = _fitted(posterior, squared, count)
-    wider = _widening(squared / (c * posterior + sigma2), count)
+    wider = widening(squared / (c * posterior + sigma2), count)
     c, sigma2 = wider * c, wider * sigma2
     calibrated_hyper = Hyperparameters(
         b_per_m=hyper.b_per_m,
@@ -67,7 +67,7 @@ def _fitted(posterior: Array, squared: Array, count: Array) -> tuple[float, floa
     return max(float(c), _SMALLEST_M2), max(float(sigma2), _SMALLEST_M2)
 
 
-def _widening(ratio: Array, count: Array) -> float:
+def widening(ratio: Array, count: Array) -> float:
     """Return the factor on the variance that puts 95 % of soundings into its 95 % interval.
 
     Noise differs between nadir and the outer beams, and a mixture has heavier tails than the

@@ -25,7 +25,7 @@ from firmware.compression.kernels import Kernel, correlation_and_slope, squared_
 from firmware.compression.losses import LossPatterns
 from firmware.geometry import Array
 
-_ROWS = 1024  # kernel rows per step: keeps a step under 10 ms
+_ROW_WORK = 1024 * 150**2  # rows x points^2 of a step: under 10 ms
 
 Float32 = NDArray[np.float32]
 T = TypeVar("T")
@@ -84,8 +84,9 @@ class ExpectedError:
         points = point_m.astype(np.float32)
         rows: list[_Rows] = []
         gram, moment = np.zeros((len(points), len(points))), np.zeros(len(points))
-        for start in range(0, len(self._depth_m), _ROWS):
-            part = slice(start, start + _ROWS)
+        height = max(128, _ROW_WORK // len(points) ** 2)
+        for start in range(0, len(self._depth_m), height):
+            part = slice(start, start + height)
             squared = squared_distance(self._position_m[part], points, b)
             k, slope = correlation_and_slope(self._kernel, squared)
             exact = k.astype(np.float64)  # float32 sums lose the small differences beta lives on
@@ -95,7 +96,7 @@ class ExpectedError:
             if gradient:
                 rows.append(_Rows(part=part, k=k, slope=slope))
             yield
-        inner = self._solved(point_m, b, gram, moment)
+        inner = yield from self._solved_steps(point_m, b, gram, moment)
         if not gradient:
             return inner.evaluation
         yield
@@ -114,7 +115,9 @@ class ExpectedError:
             yield
         return dataclasses.replace(inner.evaluation, by_position=by_position, by_log_b=by_log_b)
 
-    def _solved(self, point_m: Array, b: float, gram: Array, moment: Array) -> "_Inner":
+    def _solved_steps(
+        self, point_m: Array, b: float, gram: Array, moment: Array
+    ) -> Generator[None, None, "_Inner"]:
         """Return the best weights, their error, and the gradient through the points' own K."""
         squared = squared_distance(point_m, point_m, b)
         k, slope = correlation_and_slope(self._kernel, squared)
@@ -122,8 +125,10 @@ class ExpectedError:
         self.failed_factorisations += failed
         k = k + nugget * np.eye(len(point_m))
         inverse = cho_solve((lower, True), np.eye(len(point_m)))
+        yield
         blocks = [_Block.of(group, inverse) for group in self._groups]
         beta = self._best_weights(gram, moment, inverse, lower, blocks)
+        yield
         probability = np.concatenate([[self._no_loss], *(block.probability for block in blocks)])
         lost = [np.zeros((len(beta), 1)), *(block.weights_lost(beta) for block in blocks)]
         correction = inverse @ np.hstack(lost)

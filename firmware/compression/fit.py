@@ -1,7 +1,7 @@
 """The fit of pseudo points through the leader's own decoder, for the losses to expect."""
 
 import dataclasses
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,15 +73,42 @@ def fit_frame(bins: BinnedSoundings, max_rows: int) -> FitFrame:
     )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Dealing:
+    """Which fragment (M,) each point travels in, and which of them may be lost."""
+
+    fragment: NDArray[np.intp]
+    patterns: LossPatterns
+
+
+Dealer = Callable[[Array], Dealing]
+
+
+def dealt_evenly(fragments: int, settings: CompressionSettings) -> Dealer:
+    """Return a dealer of neighbours to different fragments, any of which may be lost.
+
+    With parity, losses leave no trace on the points, so none are trained for.
+    """
+    loss = 0.0 if settings.parity else settings.expected_loss
+
+    def deal(position_m: Array) -> Dealing:
+        return Dealing(
+            fragment=dealt_fragments(position_m, fragments),
+            patterns=loss_patterns(loss, fragments),
+        )
+
+    return deal
+
+
 def fit_steps(
-    frame: FitFrame, count: int, fragments: int, settings: CompressionSettings
+    frame: FitFrame, count: int, settings: CompressionSettings, deal: Dealer
 ) -> Generator[FittedPoints | None, None, str]:
     """Yield ever better fits, and None between small steps; the value says why it ended."""
     start_m, held = initial_points(frame.position_m, frame.depth_m, count)
     yield None
     spacing_m = spacing_of(start_m)
-    fragment = dealt_fragments(start_m, fragments)
-    patterns = patterns_of(settings, fragments)
+    dealing = deal(start_m)
+    fragment, patterns = dealing.fragment, dealing.patterns
     yield None
     kernel, log_b = yield from _choose(frame, start_m, fragment, patterns, spacing_m, settings)
     problem = ExpectedError(
@@ -133,22 +160,14 @@ def fit_steps(
         yield None if step is None else fitted(step)
 
 
-def patterns_of(settings: CompressionSettings, fragments: int) -> LossPatterns:
-    """Return the losses to train for: with parity, losses leave no trace on the points."""
-    return loss_patterns(0.0 if settings.parity else settings.expected_loss, fragments)
-
-
-def moved(
-    fitted: FittedPoints, position_m: Array, frame: FitFrame, settings: CompressionSettings
-) -> FittedPoints:
+def moved(fitted: FittedPoints, position_m: Array, frame: FitFrame, deal: Dealer) -> FittedPoints:
     """Return the fit with its points at other positions (M, 2) and the best depths there."""
-    fragments = int(fitted.fragment.max()) + 1
     problem = ExpectedError(
         frame.position_m,
         frame.depth_m,
         frame.weight,
         fitted.kernel,
-        patterns_of(settings, fragments),
+        deal(fitted.position_m).patterns,
         fitted.fragment,
         frame.ridge,
     )

@@ -4,9 +4,9 @@ from collections.abc import Generator
 
 import numpy as np
 
-from firmware.compression.fit import FitFrame, FittedPoints, spacing_of
+from firmware.compression.fit import Dealer, FitFrame, FittedPoints, spacing_of
 from firmware.compression.fitc import Fitc, FitcEvaluation, FitcParameters
-from firmware.compression.initial import dealt_fragments, initial_points
+from firmware.compression.initial import initial_points
 from firmware.compression.kernels import Kernel
 from firmware.compression.lbfgs import Trial, minimise_steps
 from firmware.compression.settings import CompressionSettings
@@ -16,7 +16,7 @@ _LOG_RANGE = 12.0  # of c and sigma^2 about the variance of depth: e^-12 of it i
 
 
 def fitc_steps(
-    frame: FitFrame, count: int, fragments: int, settings: CompressionSettings
+    frame: FitFrame, count: int, settings: CompressionSettings, deal: Dealer
 ) -> Generator[FittedPoints | None, None, str]:
     """Yield ever likelier fits, and None between small steps; the value says why it ended."""
     start_m, _ = initial_points(frame.position_m, frame.depth_m, count)
@@ -28,7 +28,7 @@ def fitc_steps(
     problem = Fitc(frame.position_m, frame.depth_m, kernel)
     log_c = float(np.log(max(frame.depth_m.var(), 1e-8)))
     offset = np.array([-np.log(2.0 * spacing_m), log_c, log_c - np.log(20.0)])
-    fragment = dealt_fragments(start_m, fragments)
+    fragment = deal(start_m).fragment
 
     def parameters(x: Array) -> FitcParameters:
         logs = offset + np.clip(x[-3:], [-3.0, -_LOG_RANGE, -_LOG_RANGE], [3.0, 3.0, 3.0])

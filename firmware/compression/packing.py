@@ -5,19 +5,32 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware.compression.results import CompressedPoints, fragment_points
+from firmware.compression.dense import DenseCode, dense_bodies
+from firmware.compression.lattice import lattice_bodies
+from firmware.compression.results import CompressedCode, CompressedPoints, fragment_points
+from firmware.compression.track_code import encode_track
 from firmware.submaps import Track
-from protocol.packets import STATES_PER_FRAGMENT, Header, SubmapPacket
+from protocol.packets import (
+    BODY_BYTES,
+    STATES_PER_FRAGMENT,
+    Header,
+    SubmapFragment,
+    SubmapPacket,
+)
 from protocol.timestamps import QUARTERS_MODULO
 
 
-def packets_from(compressed: CompressedPoints, track: Track, header: Header) -> list[SubmapPacket]:
+def packets_from(
+    compressed: CompressedPoints | CompressedCode, track: Track, header: Header
+) -> list[SubmapPacket] | list[SubmapFragment]:
     """Return the packets of a sub-map, in the order of their fragments.
 
     header gives vehicle, boot epoch, sub-map and, in time_quarters, the time of the track's first
     state; profile, fragment, fragment_count and the slice's time are filled in here. A state goes
     to the place of its whole second since the first; places without a state are NaN.
     """
+    if isinstance(compressed, CompressedCode):
+        return _fragments(compressed, _bodies(compressed, encode_track(track)), header)
     points = fragment_points(compressed)
     states = _by_second(track, STATES_PER_FRAGMENT * len(points))
     packets = []
@@ -38,6 +51,32 @@ def packets_from(compressed: CompressedPoints, track: Track, header: Header) -> 
             )
         )
     return packets
+
+
+def _bodies(compressed: CompressedCode, track: bytes) -> list[bytes]:
+    size, frames = BODY_BYTES[compressed.profile], compressed.fragment_count
+    settings = compressed.settings
+    if isinstance(compressed.code, DenseCode):
+        return dense_bodies(compressed.code, track, size, frames, settings.expected_loss)
+    return lattice_bodies(compressed.code, track, size, frames, settings)
+
+
+def _fragments(
+    compressed: CompressedPoints | CompressedCode, bodies: list[bytes], header: Header
+) -> list[SubmapFragment]:
+    """Return opaque fragments; the header's time stays that of the whole track's first state."""
+    return [
+        SubmapFragment(
+            header=dataclasses.replace(
+                header,
+                profile=compressed.profile,
+                fragment=index,
+                fragment_count=len(bodies),
+            ),
+            body=body,
+        )
+        for index, body in enumerate(bodies)
+    ]
 
 
 def _by_second(track: Track, seconds: int) -> NDArray[np.float32]:

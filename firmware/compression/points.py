@@ -8,7 +8,14 @@ from numpy.typing import NDArray
 
 from firmware.compression.binning import coarsened
 from firmware.compression.calibration import calibrated
-from firmware.compression.fit import FitFrame, FittedPoints, fit_frame, fit_steps, moved
+from firmware.compression.fit import (
+    FitFrame,
+    FittedPoints,
+    dealt_evenly,
+    fit_frame,
+    fit_steps,
+    moved,
+)
 from firmware.compression.fitc_fit import fitc_steps
 from firmware.compression.initial import hilbert_order
 from firmware.compression.kernels import Hyperparameters, Kernel
@@ -43,17 +50,13 @@ def compress_point_steps(
         For fewer than three usable cells, of which no map can be made.
     """
     bins = usable(bins)
-    if bins.depth_m.size < _FEWEST_CELLS:
-        raise EstimationError(
-            f"{bins.depth_m.size} usable cells of soundings; a sub-map needs {_FEWEST_CELLS}"
-        )
+    best = unfitted(bins, settings)
+    yield best
     cells = coarsened(bins, settings.fit_cell_m)
     count = min(PAPER_FRAGMENTS * PAPER_POINTS, cells.depth_m.size)
-    best = _unfitted(cells, count)
-    yield best
     frame = fit_frame(cells, settings.max_fit_rows)
     fit = fitc_steps if settings.method == "fitc" else fit_steps
-    steps = fit(frame, count, PAPER_FRAGMENTS, settings)
+    steps = fit(frame, count, settings, dealt_evenly(PAPER_FRAGMENTS, settings))
     waiting: FittedPoints | None = None
     packed_at = 0
     while True:
@@ -95,8 +98,20 @@ def usable(bins: BinnedSoundings) -> BinnedSoundings:
     )
 
 
-def _unfitted(cells: BinnedSoundings, count: int) -> CompressedPoints:
-    """Return cells along a Hilbert curve as they are: what can be sent before any fit."""
+def unfitted(bins: BinnedSoundings, settings: CompressionSettings) -> CompressedPoints:
+    """Return cells along a Hilbert curve as they are: what can be sent before any fit.
+
+    Raises
+    ------
+    EstimationError
+        For fewer than three cells, of which no map can be made.
+    """
+    if bins.depth_m.size < _FEWEST_CELLS:
+        raise EstimationError(
+            f"{bins.depth_m.size} usable cells of soundings; a sub-map needs {_FEWEST_CELLS}"
+        )
+    cells = coarsened(bins, settings.fit_cell_m)
+    count = min(PAPER_FRAGMENTS * PAPER_POINTS, cells.depth_m.size)
     position_m = np.column_stack([cells.north_m, cells.east_m])
     order = hilbert_order(position_m)
     chosen = order[np.linspace(0, len(order) - 1, count).round().astype(int)]
@@ -134,7 +149,7 @@ def _pack_steps(
     mean_depth_m = float(flagged(frame.mean_depth_m, steps))
     if steps is not None:
         rounded_m = without_parity(points, steps)[:, :2] - frame.origin_m
-        fitted = moved(fitted, rounded_m, frame, settings)
+        fitted = moved(fitted, rounded_m, frame, dealt_evenly(PAPER_FRAGMENTS, settings))
         yield before
         points = without_parity(_absolute(fitted, frame), steps)
     hyper = Hyperparameters(

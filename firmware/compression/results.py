@@ -5,6 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware.compression.dense import DenseCode
+from firmware.compression.lattice import LatticeCode
+from firmware.compression.settings import CompressionSettings
 from protocol.packets import Profile
 
 PAPER_FRAGMENTS, PAPER_POINTS = 10, 15
@@ -32,6 +35,17 @@ class CompressedPoints:
     fragment_count: int
     points_ned_m: NDArray[np.float32]
     hyperparameters: NDArray[np.float32]
+    report: FitReport
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CompressedCode:
+    """A sub-map of `lattice` or `dense`: its code, to be cut to frames when they are packed."""
+
+    profile: Profile
+    fragment_count: int
+    code: LatticeCode | DenseCode
+    settings: CompressionSettings
     report: FitReport
 
 

@@ -57,6 +57,23 @@ class CompressionSettings(Settings):
     iterations: int = setting(
         30, "evaluations", "0.3 s of one core; the error is then within 5 % of settled", minimum=0
     )
-    dense_points: int = setting(
-        430, "points", "as many as ten frames hold beside the track", minimum=10, maximum=450
+    dense_iterations: int = setting(
+        12, "evaluations", "of `dense`, each four times dearer than one of `paper`", minimum=0
+    )
+    frames: int = setting(
+        10, "frames", "a sub-map of `dense` or `lattice`; `paper` has ten", minimum=1, maximum=15
+    )
+    small_frames: bool = setting(False, "", "`lattice` in frames of 62 bytes instead of 256")
+    lattice_step_m: float = setting(
+        1.0,
+        "m",
+        "of the lattice: three soundings a node at 40 m altitude",
+        minimum=0.25,
+        maximum=60,
+    )
+    usable_frames: int = setting(
+        2, "frames", "of a `lattice` transfer, any of them, that already give a map", minimum=1
+    )
+    usable_bytes: int = setting(
+        60, "bytes", "of coefficients in that map: about the paper's fidelity", minimum=0
     )

@@ -12,12 +12,17 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from firmware.compression.decoder import PointDecoder, point_decoder
+from firmware.compression.dense import dense_points
+from firmware.compression.footprint import inside_footprint
 from firmware.compression.kernels import Hyperparameters
+from firmware.compression.lattice import LatticeMap, lattice_map
 from firmware.compression.mantissa import completed
+from firmware.compression.track_code import decode_track
 from firmware.geometry import Array
 from firmware.submaps import GriddedSubmap, Track
-from protocol.errors import EstimationError
-from protocol.packets import SubmapFragment, SubmapPacket, usable_states
+from protocol.errors import EstimationError, RemoteProtocolError
+from protocol.lattice import PROTECTION_BYTES
+from protocol.packets import Profile, SubmapFragment, SubmapPacket, usable_states
 from protocol.settings import Settings, setting
 from protocol.timestamps import from_quarters
 
@@ -56,14 +61,62 @@ def reconstruct_packets(
     EstimationError
         When the fragments hold nothing a map can be made of.
     """
+    if not fragments:
+        raise EstimationError("no fragment arrived; nothing can be rebuilt")
     packets = [p for _, p in sorted(fragments.items()) if isinstance(p, SubmapPacket)]
     if not packets:
-        raise EstimationError("none of the fragments holds pseudo points")
+        return _from_bodies(
+            {i: p for i, p in fragments.items() if isinstance(p, SubmapFragment)}, settings, near_s
+        )
     parts = {packet.header.fragment: packet.points_ned_m for packet in packets}
     points_ned_m, recovered = completed(parts, packets[0].hyperparameters[3])
     track = track_of_packets(packets, near_s)
     grid = reconstruct_points(points_ned_m, packets[0].hyperparameters, track, settings)
     return Reconstruction(grid=grid, track=track, recovered_points=recovered)
+
+
+def _from_bodies(
+    fragments: Mapping[int, SubmapFragment], settings: ReconstructionSettings, near_s: float
+) -> Reconstruction:
+    """Return the sub-map of opaque fragments; each carries the whole track by itself."""
+    first = next(iter(fragments.values()))
+    first_s = from_quarters(first.header.time_quarters, near_s)
+    try:
+        track, taken = decode_track(first.body[PROTECTION_BYTES:], first_s)
+        bodies = {index: fragment.body for index, fragment in fragments.items()}
+        if first.header.profile.plain is Profile.SUBMAP_DENSE:
+            points_ned_m, hyper = dense_points(bodies, taken, first.header.fragment_count)
+            grid = reconstruct_points(points_ned_m, hyper, track, settings)
+            return Reconstruction(grid=grid, track=track)
+        found = lattice_map(bodies, taken, first.header.fragment_count)
+    except RemoteProtocolError as error:
+        raise EstimationError(str(error)) from error
+    return Reconstruction(grid=lattice_grid(found, track, settings), track=track)
+
+
+def lattice_grid(
+    found: LatticeMap, track: Track, settings: ReconstructionSettings
+) -> GriddedSubmap:
+    """Return a lattice map on the leader's grid, inside the footprint that came with it."""
+    corners = np.array(
+        [[0.0, 0.0], [0.0, found.frame.columns], [found.frame.rows, 0.0], list(found.frame.shape)]
+    )
+    north_m, east_m = _axes(found.frame.positions_of(corners), settings)
+    row, column = np.nonzero(np.ones((north_m.size, east_m.size), dtype=bool))
+    position_m = np.column_stack([north_m[row], east_m[column]])
+    wanted = inside_footprint(found.mask, found.frame, position_m)
+    wanted &= found.variance_m2 <= settings.max_variance_m2
+    depth_m = np.full((north_m.size, east_m.size), np.nan)
+    depth_m[row[wanted], column[wanted]] = found.depth_m(position_m[wanted])
+    good = np.isfinite(depth_m)
+    return GriddedSubmap(
+        north0_m=float(north_m[0]),
+        east0_m=float(east_m[0]),
+        cell_m=settings.cell_m,
+        depth_m=depth_m,
+        variance_m2=np.where(good, found.variance_m2, np.nan),
+        time_s=times_of_cells(track, north_m, east_m, good),
+    )
 
 
 def track_of_packets(packets: list[SubmapPacket], near_s: float) -> Track:

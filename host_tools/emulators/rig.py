@@ -12,10 +12,13 @@ SMALLEST_STEP_S = 1e-4
 
 
 class Rig:
-    """Moves bytes between each core and its unit, from one event to the next."""
+    """Moves bytes between each core and its unit, from one event to the next.
 
-    def __init__(self, bench: Bench, cores: Mapping[int, Core]) -> None:
-        self.bench, self.cores = bench, dict(cores)
+    With a period the cores are polled on its multiples only, as a vehicle's loop does.
+    """
+
+    def __init__(self, bench: Bench, cores: Mapping[int, Core], period_s: float = 0.0) -> None:
+        self.bench, self.cores, self.period_s = bench, dict(cores), period_s
         self.now_s = 0.0
         self.unplugged: set[int] = set()
         self.events: dict[int, list[DialectEvent]] = {node: [] for node in cores}
@@ -35,6 +38,8 @@ class Rig:
             if max(next_s, self.now_s + SMALLEST_STEP_S) > time_s or math.isinf(next_s):
                 break
             self.now_s = max(next_s, self.now_s + SMALLEST_STEP_S)
+            if self.period_s:
+                self.now_s = math.ceil(self.now_s / self.period_s) * self.period_s
         self.now_s = max(self.now_s, time_s)
 
     def unplug(self, node: int) -> None:

@@ -70,8 +70,8 @@ class Core(Protocol):
     def next_wakeup_s(self, now_s: float) -> float:
         """Return when `poll` will next have something to do."""
 
-    def send(self, frame: bytes, now_s: float) -> None:
-        """Queue a frame."""
+    def send(self, frame: bytes, now_s: float, start_s: float | None = None) -> None:
+        """Queue a frame, to start at start_s or as soon as can be."""
 
     def ping(self, peer: int) -> None:
         """Ask for a two-way range."""
@@ -116,16 +116,20 @@ class DialectDriver:
         """One line on why no modem of this dialect answers; None when one does, or in the dark."""
         return self._identification.verdict
 
-    def send(self, frame: bytes, now_s: float) -> None:
+    def send(self, frame: bytes, now_s: float, start_s: float | None = None) -> None:
         """Queue a frame; the oldest goes when the queue is full.
+
+        A loop with slots hands a frame over `lead_s` before its slot and names the slot's second;
+        without start_s the frame starts as soon as can be. Either way it is stamped with the second
+        on which it really starts.
 
         Raises
         ------
         LocalProtocolError
             For a frame larger than `largest_frame_bytes`.
         """
-        self._report("send", frame, now_s)
-        self.core.send(frame, now_s)
+        self._report("send", frame, now_s if start_s is None else start_s)
+        self.core.send(frame, now_s, start_s)
 
     def poll(self, now_s: float) -> None:
         """Move bytes both ways; never blocks, never raises."""

@@ -45,8 +45,10 @@ class MicroModem(Traffic):
             times.append(max(self._begin_s(max(now_s, self._pause_until_s)), now_s))
         return max(now_s, min(times))
 
-    def send(self, frame: bytes, now_s: float) -> None:
+    def send(self, frame: bytes, now_s: float, start_s: float | None = None) -> None:
         """Queue a frame to start on the first whole second that leaves time to load it.
+
+        With start_s it starts on that second or later; hand it over `lead_s` before.
 
         Raises
         ------
@@ -54,7 +56,7 @@ class MicroModem(Traffic):
             When the rate's frames are smaller.
         """
         self._check_size(frame)
-        self.outbox.put(frame, now_s)
+        self.outbox.put(frame, now_s if start_s is None else start_s)
 
     def ping(self, peer: int) -> None:
         """Ask for a two-way range; RangeMeasured or PeerSilent follows."""

@@ -47,7 +47,7 @@ class Machine:
         self._stamp = stamp
         self._events: deque[DialectEvent] = deque(maxlen=EVENTS_CAP)
         self._output = bytearray()
-        self._later: tuple[float, Callable[[float], bytes]] | None = None
+        self._later: tuple[float, Callable[[float], None]] | None = None
         self._last_line = b""
         self._deadline_s, self._tries = math.inf, 0
         self._heard_s = 0.0
@@ -101,7 +101,8 @@ class Machine:
     def _run_waits(self, now_s: float) -> None:
         """Say what was put off, ask again what was not answered, give up after all tries."""
         if self._later is not None and now_s >= self._later[0]:
-            self._say_in_window(self._later[1], now_s, now_s)
+            (_, act), self._later = self._later, None
+            act(now_s)
         if now_s < self._deadline_s:
             return
         wait = WAITS[self.state]
@@ -128,7 +129,11 @@ class Machine:
         if now_s >= due_s:
             self._say(line_at(now_s), now_s)
         else:
-            self._later, self._deadline_s = (due_s, line_at), math.inf
+            self._do_later(due_s, lambda then_s: self._say_in_window(line_at, then_s, then_s))
+
+    def _do_later(self, due_s: float, act: Callable[[float], None]) -> None:
+        """Put an action off; nothing is waited for until then."""
+        self._later, self._deadline_s = (due_s, act), math.inf
 
     def _complain(self, text: str, now_s: float) -> None:
         self._events.append(ModemComplaint(text=text, at_s=now_s))

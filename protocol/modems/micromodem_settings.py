@@ -40,6 +40,13 @@ class MicroModemSettings(Settings):
         64, "frames", "four minutes of a follower's frames", minimum=1, maximum=4096
     )
     baud: int = setting(19200, "bit/s", "the modem's own default", minimum=300, maximum=921600)
+    poll_period_s: float = setting(
+        0.25,
+        "s",
+        "how seldom the vehicle's loop may poll; packets are begun earlier by it",
+        minimum=0.0,
+        maximum=0.5,
+    )
     pause_s: float = setting(
         2.0, "s", "first pause after a failed packet; it doubles up to 16 s", minimum=0.1
     )

@@ -39,6 +39,8 @@ TURNAROUND_S = 0.3
 """The modem's own time to answer a cycle, and a margin before the pulse."""
 LATE_S = 0.05
 """Loading a frame that ends later than this before the pulse would miss it."""
+EARLIEST_S = 0.9
+"""Loading that ends earlier than this before the planned pulse would catch the pulse before it."""
 START_TOLERANCE_S = 0.6
 """A start told this far from the planned second happened on another one."""
 LONGEST_EXTRA_LEAD_S = 1.0
@@ -77,25 +79,33 @@ class Traffic(Setup):
             flexible = self._goes_flexible()
             self._start_s = self._plan[0] if self._plan else math.ceil(now_s)
             self._plan = None
-            self.outbox.lend(1 if flexible else self.frames_per_packet, self.frame_bytes)
+            self.outbox.lend(self._most_frames(), self.frame_bytes)
             trigger = "flexible" if flexible else "packet"
             self._fire(trigger, NOTHING, now_s)
 
     def _begin_s(self, now_s: float) -> float:
         """Return when to begin the next packet, planning its second where that is not done."""
-        sizes = self.outbox.sizes(1 if self._goes_flexible() else self.frames_per_packet)
-        if not sizes:
+        sizes = self.outbox.sizes(self._most_frames())
+        first = self.outbox.first()
+        if first is None:
             self._plan = None
             return math.inf
         lead_s = self._lead_of(sizes)
-        if self._plan is None or self._plan[2] != len(sizes) or now_s > self._plan[1] + LATE_S:
-            start_s = math.ceil(now_s + lead_s - LATE_S / 2)
+        latest_s = LATE_S + self.settings.poll_period_s
+        if self._plan is None or self._plan[2] != len(sizes) or now_s > self._plan[1] + latest_s:
+            start_s = max(math.ceil(now_s + lead_s - LATE_S / 2), math.ceil(first.ready_s))
             self._plan = (float(start_s), start_s - lead_s, len(sizes))
         return self._plan[1]
 
+    def _most_frames(self) -> int:
+        return 1 if self._goes_flexible() else self.frames_per_packet
+
     def _lead_of(self, sizes: list[int]) -> float:
+        """Return how early to begin: line time, and a poll's delay at the start and per request."""
         characters = CYCLE_LINE_BYTES + sum(FRAME_LINE_BYTES + 2 * size for size in sizes)
-        return TURNAROUND_S + self._extra_lead_s + characters * 10.0 / self.settings.baud
+        delays = 1 if self._goes_flexible() else 1 + len(sizes)
+        margin_s = TURNAROUND_S + self._extra_lead_s + delays * self.settings.poll_period_s
+        return margin_s + characters * 10.0 / self.settings.baud
 
     def _goes_flexible(self) -> bool:
         first = self.outbox.first()
@@ -138,6 +148,10 @@ class Traffic(Setup):
         load_s = sum(2 * size + FRAME_LINE_BYTES for size in rest) * 10.0 / self.settings.baud
         if now_s + load_s > self._start_s - LATE_S:
             return "late"
+        due_s = self._start_s - EARLIEST_S - load_s
+        if number == len(self.outbox.lent) and now_s < due_s:
+            self._do_later(due_s, lambda then_s: self._fire("CADRQ", sentence, then_s))
+            return None
         self._stamped[number] = self._stamp(self.outbox.lent[number - 1].frame, self._start_s)
         self._say(self._data_line(self._stamped[number]), now_s)
         return "done" if number == len(self.outbox.lent) else None

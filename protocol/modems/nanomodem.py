@@ -115,8 +115,9 @@ class Nanomodem:
         due_s = self._deadline_s
         if self.state is State.IDLE:
             due_s = min(due_s, self._heard_s + ALIVE_QUERY_S)
-            if self._requests or self._quality_due or self.outbox.first() is not None:
+            if self._requests or self._quality_due:
                 due_s = min(due_s, self._pause_until_s)
+            due_s = min(due_s, max(self._pause_until_s, self._ready_s()))
         return max(now_s, due_s)
 
     def lost(self, now_s: float) -> None:
@@ -126,8 +127,8 @@ class Nanomodem:
         self.outbox.give_back(blame=False)
         self._enter(State.CLOSED, now_s)
 
-    def send(self, frame: bytes, now_s: float) -> None:
-        """Queue a frame.
+    def send(self, frame: bytes, now_s: float, start_s: float | None = None) -> None:
+        """Queue a frame, to be sent at once or not before start_s.
 
         Raises
         ------
@@ -140,7 +141,7 @@ class Nanomodem:
                 " profile of 256-byte frames (paper, dense) fits; take profile lattice in its"
                 " 62-byte size, or a Micro-Modem at rate 3, 4 or 5"
             )
-        self.outbox.put(frame, now_s)
+        self.outbox.put(frame, now_s if start_s is None else start_s)
 
     def ping(self, peer: int) -> None:
         """Ask for a two-way range; RangeMeasured or PeerSilent follows."""
@@ -186,8 +187,12 @@ class Nanomodem:
             self._fire("quality?", now_s)
         elif self._requests:
             self._fire("request", now_s)
-        elif self.outbox.first() is not None:
+        elif self._ready_s() <= now_s:
             self._fire("frame", now_s)
+
+    def _ready_s(self) -> float:
+        first = self.outbox.first()
+        return math.inf if first is None else first.ready_s
 
     def _take_replies(self, now_s: float) -> None:
         while (reply := self.reader.next_reply()) is not None:

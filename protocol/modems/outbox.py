@@ -2,7 +2,7 @@
 
 from collections import deque
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import islice, takewhile
 
 from protocol.modems.events import FrameDropped
 
@@ -12,7 +12,7 @@ MOST_ATTEMPTS = 8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outgoing:
-    """A frame, the earliest time it may start, and how often it was begun in vain."""
+    """A frame, the earliest second it may start on, and how often it was begun in vain."""
 
     frame: bytes
     ready_s: float
@@ -32,32 +32,31 @@ class Outbox:
         self.dropped: deque[FrameDropped] = deque(maxlen=capacity)
         self.counters = {"queued": 0, "confirmed": 0, "requeued": 0, "dropped": 0}
 
-    def put(self, frame: bytes, now_s: float) -> None:
-        """Queue a frame behind the others."""
+    def put(self, frame: bytes, ready_s: float) -> None:
+        """Queue a frame behind the others; it starts at ready_s at the earliest."""
         self.counters["queued"] += 1
         if len(self._waiting) + len(self.lent) >= self._capacity and self._waiting:
             self._drop(self._waiting.popleft(), f"queue of {self._capacity} frames full")
-        self._waiting.append(Outgoing(frame=frame, ready_s=now_s))
+        self._waiting.append(Outgoing(frame=frame, ready_s=ready_s))
 
     def first(self) -> Outgoing | None:
         """Return the frame that goes next, without lending it."""
         return self._waiting[0] if self._waiting else None
 
     def sizes(self, count: int) -> list[int]:
-        """Return the sizes of the first `count` waiting frames."""
-        return [len(item.frame) for item in islice(self._waiting, count)]
+        """Return the sizes of up to `count` waiting frames that may start with the first one."""
+        return [len(item.frame) for item in self._together(count)]
 
     def __len__(self) -> int:
         return len(self._waiting) + len(self.lent)
 
     def lend(self, count: int, longest_bytes: int) -> tuple[Outgoing, ...]:
         """Lend up to `count` leading frames of at most that size; they count as on their way."""
-        batch: list[Outgoing] = []
-        while self._waiting and len(batch) < count:
-            if len(self._waiting[0].frame) > longest_bytes:
-                break
-            batch.append(self._waiting.popleft())
-        self.lent = tuple(batch)
+        self.lent = tuple(
+            takewhile(lambda item: len(item.frame) <= longest_bytes, self._together(count))
+        )
+        for _ in self.lent:
+            self._waiting.popleft()
         return self.lent
 
     def confirm(self) -> tuple[Outgoing, ...]:
@@ -76,6 +75,12 @@ class Outbox:
                 self._drop(tried, f"refused {tried.attempts} times by the modem")
             else:
                 self._waiting.appendleft(tried)
+
+    def _together(self, count: int) -> list[Outgoing]:
+        """Return leading frames that one packet may take: none has to wait for a later second."""
+        latest_s = self._waiting[0].ready_s + 0.5 if self._waiting else 0.0
+        leading = islice(self._waiting, count)
+        return list(takewhile(lambda item: item.ready_s <= latest_s, leading))
 
     def _drop(self, item: Outgoing, reason: str) -> None:
         self.counters["dropped"] += 1

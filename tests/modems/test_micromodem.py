@@ -305,9 +305,9 @@ def test_pairs_in_8_s_slots_and_answers_between_them_share_the_air(range_m: floa
         slot_s = 40.0 + 8.0 * slot
         rig.run_until(slot_s - follower.lead_s)
         for k in range(follower.frames_per_packet):
-            follower.send(bytes([2 * slot + k]) * 256, rig.now_s)
+            follower.send(bytes([2 * slot + k]) * 256, rig.now_s, start_s=slot_s)
         rig.run_until(slot_s + 5.0 - leader.lead_s)
-        leader.send(answer(slot), rig.now_s)
+        leader.send(answer(slot), rig.now_s, start_s=slot_s + 5.0)
     rig.run_until(90.0)
     assert len(frames_of(rig, 2)) == 10
     heard = [e for e in rig.taken(1, FrameHeard) if isinstance(e, FrameHeard)]
@@ -315,3 +315,34 @@ def test_pairs_in_8_s_slots_and_answers_between_them_share_the_air(range_m: floa
     assert rig.bench.fates == {"delivered": 10}
     starts_s = [e.start_s for e in rig.taken(1, FrameSent) if isinstance(e, FrameSent)]
     assert starts_s == [40.0 + 8.0 * (n // 2) for n in range(10)]
+
+
+@pytest.mark.parametrize("rate", [2, 4, 5])
+@pytest.mark.parametrize("period_s", [0.0, 0.02, 0.1, 0.25])
+def test_frames_start_on_their_slots_second_however_seldom_the_loop_polls(
+    period_s: float, rate: int
+) -> None:
+    rig = micro_rig(settings=MicroModemSettings(rate=rate, flexible=False))
+    rig.period_s = period_s
+    follower = core_of(rig, 1)
+    per_packet, size = follower.frames_per_packet, follower.frame_bytes
+    for slot in range(6):
+        slot_s = 40.0 + 12.0 * slot
+        rig.run_until(slot_s - follower.lead_s - 0.25)
+        for k in range(1 + slot % per_packet):
+            follower.send(bytes([slot, k]) * (size // 2), rig.now_s, start_s=slot_s)
+        rig.run_until(slot_s + 8.0)
+    starts_s = [e.start_s for e in rig.taken(1, FrameSent) if isinstance(e, FrameSent)]
+    expected = [40.0 + 12.0 * s for s in range(6) for _ in range(1 + s % per_packet)]
+    assert starts_s == expected
+    heard = [e for e in rig.taken(2, FrameHeard) if isinstance(e, FrameHeard)]
+    assert [e.toa_s for e in heard] == pytest.approx([s + 0.4 for s in expected], abs=1e-3)
+    assert follower.counters["late"] == 0
+
+
+def test_an_answer_named_for_a_second_does_not_start_on_the_one_before() -> None:
+    rig = micro_rig()
+    rig.run_until(38.0)
+    rig.cores[1].send(answer(), rig.now_s, start_s=42.0)
+    rig.run_until(50.0)
+    assert [e.start_s for e in rig.taken(1, FrameSent) if isinstance(e, FrameSent)] == [42.0]

@@ -1,30 +1,18 @@
 """Matching of two sub-maps: Eq. (8) and (10), what they leave open, and how sure the answer is."""
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from firmware.geometry import Array
 from firmware.leader import ambiguity
-from firmware.leader.alignment import Aligned, NoiseModel, fields_of
+from firmware.leader.alignment import Aligned, fields_of
 from firmware.leader.covariance import Refined, measure
 from firmware.leader.matches import Match, MatchingSettings, MatchOutcome, NoMatch
+from firmware.leader.pair_problem import PairProblem, pair_problem, relief_of
 from firmware.leader.refinement import refine
-from firmware.leader.relief import (
-    Spectrum,
-    WaveNoise,
-    fine_relief_m2,
-    information_per_cell,
-    spectrum,
-)
-from firmware.leader.screening import (
-    ErrorSurface,
-    Layer,
-    error_at,
-    error_surface,
-    mean_slope2,
-    prepare,
-)
+from firmware.leader.screening import ErrorSurface
 from firmware.submaps import GriddedSubmap
 from protocol.errors import EstimationError
 
@@ -67,88 +55,43 @@ def match(
     EstimationError
         When the grids differ in cell size or the prior is not a covariance.
     """
-    _check(reference, query, prior_covariance_m2)
-    layer_r = prepare(reference, reconstructed=reference_reconstructed)
-    layer_q = prepare(query, reconstructed=query_reconstructed)
-    if layer_r is None or layer_q is None:
+    problem = pair_problem(
+        reference,
+        query,
+        settings,
+        reference_reconstructed=reference_reconstructed,
+        query_reconstructed=query_reconstructed,
+    )
+    if problem is None:
         return _none(NoMatch.EMPTY)
-    prior_m, covariance_m2 = np.asarray(prior_shift_m), np.asarray(prior_covariance_m2)
-    return _search(_problem(layer_r, layer_q, prior_m, covariance_m2, settings), times_s)
+    prior = _Prior(np.asarray(prior_shift_m), _checked(prior_covariance_m2))
+    return _search(problem, prior, times_s)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Problem:
-    """What stays the same while one pair is matched."""
+class _Prior(NamedTuple):
+    """What the graph believes of the shift before the match."""
 
-    reference: Layer
-    query: Layer
-    prior_m: Array
+    mean_m: Array
     covariance_m2: Array
-    settings: MatchingSettings
-    noise: NoiseModel
-    minimum_cells: float
-    ridge_cells: float
-    spectra: tuple[Spectrum, Spectrum]
-    white_m2: float
-    shared_m2: float
 
 
-def _problem(
-    reference: Layer,
-    query: Layer,
-    prior_m: Array,
-    covariance_m2: Array,
-    settings: MatchingSettings,
-) -> _Problem:
-    """Return the problem with every layer charged with its share of the noise.
-
-    A reconstruction misses the waves that are shorter than its points can carry; how high they
-    are is told by the finer of the two spectra.
-    """
-    spectra = (spectrum(reference), spectrum(query))
-    fine_m2 = max(fine_relief_m2(s, settings.finest_wave_m) for s in spectra)
-    slope2 = 0.5 * (mean_slope2(reference.grid) + mean_slope2(query.grid))
-    half_m2 = 0.5 * settings.cell_sigma_m**2 + settings.position_sigma_m**2 * slope2
-    layers = [
-        layer.charged(fine_m2 if layer.reconstructed else 0.0, half_m2)
-        for layer in (reference, query)
-    ]
-    noise_m2 = sum(_per_cell(layer.noise_m2, layer) for layer in layers)
-    rebuilt_m2 = sum(_per_cell(layer.map_m2, layer) for layer in layers if layer.reconstructed)
-    shared_m2 = settings.correlated_share * rebuilt_m2
-    offset_m2 = settings.depth_offset_sigma_m**2
-    return _Problem(
-        reference=layers[0],
-        query=layers[1],
-        prior_m=prior_m,
-        covariance_m2=covariance_m2,
-        settings=settings,
-        noise=_noise_model(settings, shared_m2 / noise_m2),
-        minimum_cells=settings.minimum_overlap_m2 / query.grid.cell_m**2,
-        ridge_cells=noise_m2 / offset_m2 if offset_m2 > 0.0 else np.inf,
-        spectra=spectra,
-        white_m2=noise_m2 - shared_m2,
-        shared_m2=shared_m2,
-    )
-
-
-def _search(problem: _Problem, times_s: tuple[float | None, float | None]) -> MatchOutcome:
+def _search(
+    problem: PairProblem, prior: _Prior, times_s: tuple[float | None, float | None]
+) -> MatchOutcome:
     """Return the outcome: screen, evidence, refinement, gates."""
-    whole = error_surface(
-        problem.reference, problem.query, problem.minimum_cells, problem.ridge_cells
-    )
-    surface = _window(whole, problem)
+    whole = problem.surface()
+    surface = _window(whole, prior, problem)
     if surface is None or not np.isfinite(surface.residual_m2).any():
         return _none(NoMatch.NO_OVERLAP)
-    relief = _relief(whole, surface, problem)
+    relief = relief_of(problem, whole, _best(surface))
     if relief is None:
         return _none(NoMatch.FEATURELESS)
-    found = _posterior(surface, _evidence(surface, relief), problem)
-    candidates = _refine_best(surface, found, problem, times_s)
+    found = _posterior(surface, _evidence(surface, relief), prior, problem)
+    candidates = _refine_best(surface, found, prior, problem, times_s)
     if not candidates:
         return _none(NoMatch.UNSETTLED)
     scale = _tolerated(min(c.residual_m2 / c.noise_m2 for c in candidates))
-    relief = replace(relief, noise_scale=scale, information_per_cell=_information(problem, scale))
+    relief = replace(relief, noise_scale=scale, information_per_cell=problem.information(scale))
     evidence = _evidence(surface, relief)
     refined = [_evidence_at(candidate, relief) for candidate in candidates]
     for candidate, value in zip(candidates, refined, strict=True):
@@ -156,8 +99,8 @@ def _search(problem: _Problem, times_s: tuple[float | None, float | None]) -> Ma
         evidence[row, col] = max(evidence[row, col], value)
     scores = [value + c.log_prior for c, value in zip(candidates, refined, strict=True)]
     best = int(np.argmax(scores))
-    found = _posterior(surface, evidence, problem)
-    return _decide(candidates[best], refined[best], found, problem)
+    found = _posterior(surface, evidence, prior, problem)
+    return _decide(candidates[best], refined[best], found, prior, problem)
 
 
 def _tolerated(misfit: float) -> float:
@@ -187,56 +130,37 @@ def _evidence_at(candidate: _Candidate, relief: ambiguity.Relief) -> float:
     )
 
 
-def _window(whole: ErrorSurface, problem: _Problem) -> ErrorSurface | None:
+def _window(whole: ErrorSurface, prior: _Prior, problem: PairProblem) -> ErrorSurface | None:
     """Return the part of the surface that the prior allows, None if it is empty."""
     settings = problem.settings
-    half = settings.search_sigmas * np.sqrt(np.diag(problem.covariance_m2))
+    half = settings.search_sigmas * np.sqrt(np.diag(prior.covariance_m2))
     half = np.minimum(half + 2.0 * problem.query.grid.cell_m, settings.search_cap_m)
-    north = np.flatnonzero(np.abs(whole.north_m - problem.prior_m[0]) <= half[0])
-    east = np.flatnonzero(np.abs(whole.east_m - problem.prior_m[1]) <= half[1])
+    north = np.flatnonzero(np.abs(whole.north_m - prior.mean_m[0]) <= half[0])
+    east = np.flatnonzero(np.abs(whole.east_m - prior.mean_m[1]) <= half[1])
     if north.size < 2 or east.size < 2:
         return None
     return whole.window(slice(north[0], north[-1] + 1), slice(east[0], east[-1] + 1))
 
 
-def _relief(
-    whole: ErrorSurface, surface: ErrorSurface, problem: _Problem
-) -> ambiguity.Relief | None:
-    """Return background, noise and the information of the relief."""
+def _best(surface: ErrorSurface) -> Array:
+    """Return the lattice shift of least E."""
     row, col = np.unravel_index(int(np.argmin(surface.residual_m2)), surface.residual_m2.shape)
-    best_m = np.array([surface.north_m[row], surface.east_m[col]])
-    away_m = 3.0 * problem.settings.basin_m
-    background = ambiguity.background(whole, best_m, away_m)
-    if background is None:
-        return None
-    return ambiguity.Relief(
-        background=background,
-        information_per_cell=_information(problem, noise_scale=1.0),
-        coherent_cells=problem.settings.coherent_overlap_m2 / problem.query.grid.cell_m**2,
-    )
+    return np.array([surface.north_m[row], surface.east_m[col]])
 
 
-def _information(problem: _Problem, noise_scale: float) -> float:
-    """Return the information per cell of the layer that has less of it."""
-    noise = WaveNoise(
-        white_m2=problem.white_m2 * noise_scale,
-        shared_m2=problem.shared_m2 * noise_scale,
-        correlation_m=problem.settings.correlation_m,
-        position_sigma_m=problem.settings.position_sigma_m,
-    )
-    return min(information_per_cell(relief, noise) for relief in problem.spectra)
-
-
-def _posterior(surface: ErrorSurface, evidence: Array, problem: _Problem) -> ambiguity.Posterior:
+def _posterior(
+    surface: ErrorSurface, evidence: Array, prior: _Prior, problem: PairProblem
+) -> ambiguity.Posterior:
     return ambiguity.posterior(
-        surface, evidence, problem.prior_m, problem.covariance_m2, problem.settings.null_share
+        surface, evidence, prior.mean_m, prior.covariance_m2, problem.settings.null_share
     )
 
 
 def _refine_best(
     surface: ErrorSurface,
     found: ambiguity.Posterior,
-    problem: _Problem,
+    prior: _Prior,
+    problem: PairProblem,
     times_s: tuple[float | None, float | None],
 ) -> list[_Candidate]:
     """Return the refined minima among the best lattice shifts."""
@@ -244,16 +168,16 @@ def _refine_best(
         fields_of(problem.reference, problem.settings.slope_smoothing_cells),
         fields_of(problem.query, problem.settings.slope_smoothing_cells),
     )
-    inverse = np.linalg.inv(problem.covariance_m2)
+    inverse = np.linalg.inv(prior.covariance_m2)
     candidates = []
     for start_m in _starts(surface, found, problem.settings, problem.query.grid.cell_m):
         field = refine(problem.reference, problem.query, fields, start_m, times_s, problem.noise)
         if field is None:
             continue
-        error, count, _ = _error(problem, field.shift_m, absolute=False)
+        error, count, _ = problem.error_at(field.shift_m, absolute=False)
         if not np.isfinite(error):
             continue
-        away = field.shift_m - problem.prior_m
+        away = field.shift_m - prior.mean_m
         candidates.append(
             _Candidate(
                 field=field,
@@ -288,7 +212,11 @@ def _starts(
 
 
 def _decide(
-    winner: _Candidate, evidence: float, found: ambiguity.Posterior, problem: _Problem
+    winner: _Candidate,
+    evidence: float,
+    found: ambiguity.Posterior,
+    prior: _Prior,
+    problem: PairProblem,
 ) -> MatchOutcome:
     """Return the winner as a closure in the plane or along one axis, or the gate it failed.
 
@@ -296,7 +224,7 @@ def _decide(
     has chosen among repetitions of a pattern.
     """
     settings, refined = problem.settings, measure(winner.field, problem.noise)
-    residual, _, _ = _error(problem, refined.shift_m, absolute=settings.residual == "absolute")
+    residual, _, _ = problem.error_at(refined.shift_m, absolute=settings.residual == "absolute")
     limit = settings.residual_noise_ratio * refined.variance_m2
     if settings.residual == "absolute":
         limit = np.sqrt(limit)
@@ -312,7 +240,7 @@ def _decide(
     walk = np.eye(2) * refined.walk_m2
     if certain and sigmas[1] <= settings.sigma_limit_m:
         return _closure(refined, residual, evidence, covariance + walk, None, verdict.false_mass)
-    free_m = np.sqrt(vectors[:, 1] @ problem.covariance_m2 @ vectors[:, 1])
+    free_m = np.sqrt(vectors[:, 1] @ prior.covariance_m2 @ vectors[:, 1])
     if certain and min(sigmas[1] / 2.0, free_m) <= settings.basin_m:
         axis, false_mass = vectors[:, 0], verdict.false_mass
     elif not certain and verdict.false_mass_off_line <= settings.false_mass_limit:
@@ -354,17 +282,6 @@ def _closure(
     return MatchOutcome(match=found, reason=None)
 
 
-def _error(problem: _Problem, shift_m: Array, *, absolute: bool) -> tuple[float, int, float]:
-    return error_at(
-        problem.reference,
-        problem.query,
-        shift_m,
-        problem.minimum_cells,
-        problem.ridge_cells,
-        absolute=absolute,
-    )
-
-
 def _nearest(surface: ErrorSurface, shift_m: Array) -> tuple[int, int]:
     return (
         int(np.argmin(np.abs(surface.north_m - shift_m[0]))),
@@ -376,31 +293,10 @@ def _none(reason: NoMatch) -> MatchOutcome:
     return MatchOutcome(match=None, reason=reason)
 
 
-def _per_cell(values: Array, layer: Layer) -> float:
-    return float(values.sum() / layer.known.sum())
-
-
-def _check(reference: GriddedSubmap, query: GriddedSubmap, covariance_m2: Array) -> None:
-    if abs(reference.cell_m - query.cell_m) > 1e-9:
+def _checked(covariance_m2: Array) -> Array:
+    covariance = np.asarray(covariance_m2, dtype=np.float64)
+    if not np.all(np.isfinite(covariance)) or np.linalg.eigvalsh(covariance)[0] <= 0.0:
         raise EstimationError(
-            f"grids of {reference.cell_m} m and {query.cell_m} m cells cannot be matched; "
-            "grid both alike"
+            f"prior covariance {covariance.tolist()} m^2 is not positive definite"
         )
-    if not np.all(np.isfinite(covariance_m2)) or np.linalg.eigvalsh(covariance_m2)[0] <= 0.0:
-        raise EstimationError(
-            f"prior covariance {np.asarray(covariance_m2).tolist()} m^2 is not positive definite"
-        )
-
-
-def _noise_model(settings: MatchingSettings, correlated_share: float) -> NoiseModel:
-    return NoiseModel(
-        cell_sigma_m=settings.cell_sigma_m,
-        position_sigma_m=settings.position_sigma_m,
-        offset_sigma_m=settings.depth_offset_sigma_m,
-        tilt_sigma=settings.tilt_sigma,
-        bend_sigma_per_m=settings.bend_sigma_per_m,
-        drift_sigma_mps=settings.drift_sigma_mps,
-        walk_m2_per_s=settings.walk_m2_per_s,
-        correlation_m=settings.correlation_m,
-        correlated_share=correlated_share,
-    )
+    return covariance

@@ -1,0 +1,149 @@
+"""Two sub-maps made ready for matching: layers, noise and spectra."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from firmware.geometry import Array
+from firmware.leader.alignment import NoiseModel
+from firmware.leader.ambiguity import Relief, background
+from firmware.leader.matches import MatchingSettings
+from firmware.leader.relief import (
+    Spectrum,
+    WaveNoise,
+    fine_relief_m2,
+    information_per_cell,
+    spectrum,
+)
+from firmware.leader.screening import (
+    ErrorSurface,
+    Layer,
+    error_at,
+    error_surface,
+    mean_slope2,
+    prepare,
+)
+from firmware.submaps import GriddedSubmap
+from protocol.errors import EstimationError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairProblem:
+    """Two layers with their share of the noise, and all that stays the same while they match."""
+
+    reference: Layer
+    query: Layer
+    settings: MatchingSettings
+    noise: NoiseModel
+    minimum_cells: float
+    ridge_cells: float
+    spectra: tuple[Spectrum, Spectrum]
+    white_m2: float
+    shared_m2: float
+
+    def surface(self) -> ErrorSurface:
+        """Return E at every lattice shift."""
+        return error_surface(self.reference, self.query, self.minimum_cells, self.ridge_cells)
+
+    def error_at(self, shift_m: Array, *, absolute: bool) -> tuple[float, int, float]:
+        """Return E at any shift, the overlap in cells and the depth offset."""
+        return error_at(
+            self.reference,
+            self.query,
+            shift_m,
+            self.minimum_cells,
+            self.ridge_cells,
+            absolute=absolute,
+        )
+
+    def information(self, noise_scale: float) -> float:
+        """Return the information per cell of the layer that has less of it."""
+        noise = WaveNoise(
+            white_m2=self.white_m2 * noise_scale,
+            shared_m2=self.shared_m2 * noise_scale,
+            correlation_m=self.settings.correlation_m,
+            position_sigma_m=self.settings.position_sigma_m,
+        )
+        return min(information_per_cell(relief, noise) for relief in self.spectra)
+
+
+def pair_problem(
+    reference: GriddedSubmap,
+    query: GriddedSubmap,
+    settings: MatchingSettings,
+    *,
+    reference_reconstructed: bool,
+    query_reconstructed: bool,
+) -> PairProblem | None:
+    """Return the problem of matching two grids, None when one of them is empty.
+
+    A reconstruction misses the waves that are shorter than its points can carry; how high they
+    are is told by the finer of the two spectra.
+
+    Raises
+    ------
+    EstimationError
+        When the grids differ in cell size.
+    """
+    if abs(reference.cell_m - query.cell_m) > 1e-9:
+        raise EstimationError(
+            f"grids of {reference.cell_m} m and {query.cell_m} m cells cannot be matched; "
+            "grid both alike"
+        )
+    bare = [
+        prepare(reference, reconstructed=reference_reconstructed),
+        prepare(query, reconstructed=query_reconstructed),
+    ]
+    present = [layer for layer in bare if layer is not None]
+    if len(present) < len(bare):
+        return None
+    spectra = (spectrum(present[0]), spectrum(present[1]))
+    fine_m2 = max(fine_relief_m2(s, settings.finest_wave_m) for s in spectra)
+    slope2 = 0.5 * sum(mean_slope2(layer.grid) for layer in present)
+    half_m2 = 0.5 * settings.cell_sigma_m**2 + settings.position_sigma_m**2 * slope2
+    layers = [layer.charged(fine_m2 if layer.reconstructed else 0.0, half_m2) for layer in present]
+    noise_m2 = sum(_per_cell(layer.noise_m2, layer) for layer in layers)
+    rebuilt_m2 = sum(_per_cell(layer.map_m2, layer) for layer in layers if layer.reconstructed)
+    shared_m2 = settings.correlated_share * rebuilt_m2
+    offset_m2 = settings.depth_offset_sigma_m**2
+    return PairProblem(
+        reference=layers[0],
+        query=layers[1],
+        settings=settings,
+        noise=_noise_model(settings, shared_m2 / noise_m2),
+        minimum_cells=settings.minimum_overlap_m2 / query.cell_m**2,
+        ridge_cells=noise_m2 / offset_m2 if offset_m2 > 0.0 else np.inf,
+        spectra=spectra,
+        white_m2=noise_m2 - shared_m2,
+        shared_m2=shared_m2,
+    )
+
+
+def relief_of(problem: PairProblem, whole: ErrorSurface, best_m: Array) -> Relief | None:
+    """Return what sets the scale of the evidence, None where no background can be told."""
+    level = background(whole, best_m, 3.0 * problem.settings.basin_m)
+    if level is None:
+        return None
+    return Relief(
+        background=level,
+        information_per_cell=problem.information(noise_scale=1.0),
+        coherent_cells=problem.settings.coherent_overlap_m2 / problem.query.grid.cell_m**2,
+    )
+
+
+def _per_cell(values: Array, layer: Layer) -> float:
+    return float(values.sum() / layer.known.sum())
+
+
+def _noise_model(settings: MatchingSettings, correlated_share: float) -> NoiseModel:
+    return NoiseModel(
+        cell_sigma_m=settings.cell_sigma_m,
+        position_sigma_m=settings.position_sigma_m,
+        offset_sigma_m=settings.depth_offset_sigma_m,
+        tilt_sigma=settings.tilt_sigma,
+        bend_sigma_per_m=settings.bend_sigma_per_m,
+        drift_sigma_mps=settings.drift_sigma_mps,
+        walk_m2_per_s=settings.walk_m2_per_s,
+        correlation_m=settings.correlation_m,
+        correlated_share=correlated_share,
+    )

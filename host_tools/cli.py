@@ -8,12 +8,18 @@ from typing import NoReturn
 
 from threadpoolctl import threadpool_limits
 
-from host_tools import config_show, inspector, simulate
+from host_tools import config_show, inspector, reproduce, simulate
 from host_tools.commands import Command
+from host_tools.processes import channel, demo, vehicle
 from protocol.errors import FathomError
 
 COMMANDS: tuple[Command, ...] = (
     simulate.COMMAND,
+    demo.COMMAND,
+    channel.COMMAND,
+    vehicle.FOLLOWER,
+    vehicle.LEADER_COMMAND,
+    reproduce.COMMAND,
     inspector.COMMAND,
     config_show.COMMAND,
 )

@@ -25,7 +25,7 @@ from host_tools.scenario import ScenarioSettings
 from host_tools.simulator.multibeam import Multibeam, Poses
 from host_tools.simulator.placement import Site
 from protocol.errors import EstimationError
-from protocol.packets import Header, Profile, SubmapPacket
+from protocol.packets import Header, Profile, SubmapFragment, SubmapPacket
 from protocol.settings import replace
 
 SUBMAP_S = 40.0
@@ -114,7 +114,7 @@ def run_trial(
     *,
     pairs: int = PAIRS,
     losses: Sequence[float] = LOSSES,
-    progress: Callable[[int], None] | None = None,
+    progress: Callable[[int], object] | None = None,
 ) -> TrialResult:
     """Return Figure 8's numbers over the pairs, by our gates and by the paper's alone."""
     rng = np.random.default_rng([seed, 0xF18])
@@ -214,7 +214,7 @@ def _moved(bins: BinnedSoundings, by_m: Array) -> BinnedSoundings:
 
 
 def _rebuilt(
-    packets: Sequence[SubmapPacket], loss: float, rng: np.random.Generator
+    packets: Sequence[SubmapPacket | SubmapFragment], loss: float, rng: np.random.Generator
 ) -> GriddedSubmap | None:
     """Return the sub-map of the packets that survive, None if nothing can be made of them."""
     arrived = {k: packet for k, packet in enumerate(packets) if rng.random() >= loss}

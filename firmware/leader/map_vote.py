@@ -1,0 +1,171 @@
+"""Whether the map that a closure builds agrees with itself where the match did not look.
+
+The paper rejects invalid closures by the consistency of the map they build (its MCM; the text of
+its reference is not to be had, so this is designed from that description). A closure between two
+sub-maps moves their neighbours along with it. Where neighbours then overlap, a valid closure lays
+like on like, and an invalid one does not. Each such window votes with a log-likelihood ratio of
+agreement against unrelated seabed, averaged over what dead reckoning leaves open; a flat seabed
+and a window without overlap abstain.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from firmware.geometry import Array
+from firmware.leader.ambiguity import Relief
+from firmware.leader.matches import MatchingSettings
+from firmware.leader.pair_problem import PairProblem, pair_problem, relief_of
+from firmware.leader.screening import ErrorSurface
+from firmware.submaps import GriddedSubmap
+from protocol.settings import Settings, setting
+
+_LEAST_BACKGROUND = 1.5  # of the noise; where blind shifts fit as well, agreement says nothing
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VoteSettings(Settings):
+    """How windows vote."""
+
+    tolerance: float = setting(
+        1.5, "", "misfit over the noise model that a true window may have", minimum=1.0
+    )
+    pivot: float = setting(
+        2.0, "", "excess over the tolerated misfit that speaks neither for nor against", minimum=1.1
+    )
+    window_limit: float = setting(
+        6.0, "", "log ratio beyond which one window may not carry the vote", minimum=0.1
+    )
+    reach_sigmas: float = setting(
+        2.5, "", "of the predicted shift, looked over in every window", minimum=0.5
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VoteWindow:
+    """Two neighbours of a closure's sub-maps, drift removed, each in its raw dead reckoning.
+
+    shift_m (2,) is what the closure says is to be added to the query's coordinates so that it lies
+    on the reference, covariance_m2 (2, 2) of it with the dead reckoning since (`carried`).
+    """
+
+    reference: GriddedSubmap
+    query: GriddedSubmap
+    shift_m: Array
+    covariance_m2: Array
+    reference_reconstructed: bool = False
+    query_reconstructed: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Vote:
+    """Sum of the windows' log ratios: above zero the map agrees, below it contradicts.
+
+    ratios holds one value per window in the order given, zero for those that abstain; informed
+    counts the others.
+    """
+
+    log_ratio: float
+    informed: int
+    ratios: tuple[float, ...]
+
+
+def vote(windows: Iterable[VoteWindow], matching: MatchingSettings, settings: VoteSettings) -> Vote:
+    """Return the vote of the windows on a closure."""
+    ratios = tuple(_ratio(window, matching, settings) for window in windows)
+    return Vote(
+        log_ratio=float(sum(ratios)),
+        informed=sum(ratio != 0.0 for ratio in ratios),
+        ratios=ratios,
+    )
+
+
+def carried(
+    shift_m: Array,
+    covariance_m2: Array,
+    ages_s: tuple[float, float],
+    drifts_mps: tuple[Array, Array],
+    settings: MatchingSettings,
+) -> tuple[Array, Array]:
+    """Return shift and covariance for neighbours of a pair.
+
+    ages_s are the reference neighbour's time minus the reference's and the same for the query;
+    drifts_mps the velocity errors (2,) that were removed from each vehicle's grids. Dead reckoning
+    that drifts by D lays a grid D too far: the shift is D of the reference minus D of the query.
+    """
+    shift = shift_m + ages_s[0] * drifts_mps[0] - ages_s[1] * drifts_mps[1]
+    walk_m2 = sum(
+        settings.walk_m2_per_s * abs(age_s) + (settings.drift_sigma_mps * age_s) ** 2
+        for age_s in ages_s
+    )
+    return shift, covariance_m2 + walk_m2 * np.eye(2)
+
+
+def _ratio(window: VoteWindow, matching: MatchingSettings, settings: VoteSettings) -> float:
+    problem = pair_problem(
+        window.reference,
+        window.query,
+        matching,
+        reference_reconstructed=window.reference_reconstructed,
+        query_reconstructed=window.query_reconstructed,
+    )
+    if problem is None:
+        return 0.0
+    surface = problem.surface()
+    north, east, weight = _predicted(surface, window, settings.reach_sigmas)
+    if weight.size == 0:
+        return 0.0
+    whole = surface.window(north, east)
+    relief = relief_of(problem, surface, window.shift_m)
+    if relief is None or relief.background < _LEAST_BACKGROUND * settings.tolerance:
+        return 0.0
+    ratio = _log_ratio(whole, problem, relief, settings)
+    mean = float(np.log(np.sum(weight * np.exp(ratio))))
+    return float(np.clip(mean, -settings.window_limit, settings.window_limit))
+
+
+def _predicted(
+    surface: ErrorSurface, window: VoteWindow, reach_sigmas: float
+) -> tuple[slice, slice, Array]:
+    """Return the rectangle of shifts that the prediction allows, and their weights (sum 1)."""
+    cell_m = window.query.cell_m
+    spread = window.covariance_m2 + np.eye(2) * cell_m**2 / 12.0
+    half = np.maximum(reach_sigmas * np.sqrt(np.diag(spread)), cell_m)
+    ranges = []
+    for axis_m, centre_m, half_m in zip(
+        (surface.north_m, surface.east_m), window.shift_m, half, strict=True
+    ):
+        inside = np.flatnonzero(np.abs(axis_m - centre_m) <= half_m)
+        if not inside.size:
+            return slice(0), slice(0), np.zeros((0, 0))
+        ranges.append(slice(int(inside[0]), int(inside[-1]) + 1))
+    north = surface.north_m[ranges[0]] - window.shift_m[0]
+    east = surface.east_m[ranges[1]] - window.shift_m[1]
+    inverse = np.linalg.inv(spread)
+    square = (
+        inverse[0, 0] * north[:, None] ** 2
+        + 2.0 * inverse[0, 1] * north[:, None] * east[None, :]
+        + inverse[1, 1] * east[None, :] ** 2
+    )
+    weight = np.exp(-0.5 * square)
+    return ranges[0], ranges[1], weight / weight.sum()
+
+
+def _log_ratio(
+    surface: ErrorSurface, problem: PairProblem, relief: Relief, settings: VoteSettings
+) -> Array:
+    """Return the log ratio of agreement over unrelated seabed at each shift, zero without overlap.
+
+    It falls with log(E / noise): +N I where E is what the noise makes, zero at the pivot or half
+    way to the background, -N I as far beyond.
+    """
+    usable = np.isfinite(surface.residual_m2)
+    misfit = np.where(usable, surface.residual_m2 / surface.noise_m2, 1.0) / settings.tolerance
+    level = relief.background / settings.tolerance
+    pivot = min(np.log(settings.pivot), 0.5 * np.log(level))
+    share = 1.0 - np.log(np.maximum(misfit, 1.0)) / pivot
+    cells = np.minimum(surface.overlap_cells, relief.coherent_cells)
+    information = problem.information(noise_scale=settings.tolerance)
+    ratio = cells * information * np.maximum(share, -1.0)
+    return np.where(usable, np.clip(ratio, -50.0, 50.0), 0.0)

@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.matching import DURATION_S, SPEED_MPS, TERRAINS, Seabed, survey, synthetic, terrain
 from firmware.leader.map_vote import VoteSettings, VoteWindow, carried, vote
-from firmware.leader.matching import MatchingSettings
+from firmware.leader.matching import MatchingSettings, match
 from firmware.submaps import GriddedSubmap
 
 NEIGHBOURS = (-1, 0, 1)
@@ -81,6 +81,8 @@ def main() -> None:
                 continue
             first = line(bed, middle, 0.0, rng)
             second = line(bed, middle + rng.uniform(-30, 30, 2), np.pi / 2.0, rng)
+            found = match(first[1], second[1], np.zeros(2), 100.0 * np.eye(2), matching).match
+            misfit = found.residual / found.variance_m2 if found else 1.0
             angle, wrong_m = rng.uniform(0, 2 * np.pi), rng.uniform(8.0, 60.0)
             for shift, votes in (
                 (rng.normal(0.0, 0.7, 2), valid),
@@ -88,7 +90,7 @@ def main() -> None:
             ):
                 made = windows(first, second, shift, rng, matching)
                 started = time.perf_counter()
-                votes.append(vote(made, matching, settings).log_ratio)
+                votes.append(vote(made, matching, settings, misfit).log_ratio)
                 took_s.append(time.perf_counter() - started)
         right = np.quantile(valid, [0.05, 0.5, 0.95])
         wrong = np.quantile(invalid, [0.05, 0.5, 0.95])

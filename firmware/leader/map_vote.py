@@ -22,6 +22,7 @@ from firmware.submaps import GriddedSubmap
 from protocol.settings import Settings, setting
 
 _LEAST_BACKGROUND = 1.5  # of the noise; where blind shifts fit as well, agreement says nothing
+_MISFIT_RANGE = (0.5, 2.0)  # outside, the match was lucky or the noise model is wrong
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,9 +72,19 @@ class Vote:
     ratios: tuple[float, ...]
 
 
-def vote(windows: Iterable[VoteWindow], matching: MatchingSettings, settings: VoteSettings) -> Vote:
-    """Return the vote of the windows on a closure."""
-    ratios = tuple(_ratio(window, matching, settings) for window in windows)
+def vote(
+    windows: Iterable[VoteWindow],
+    matching: MatchingSettings,
+    settings: VoteSettings,
+    matched_misfit: float = 1.0,
+) -> Vote:
+    """Return the vote of the windows on a closure.
+
+    matched_misfit is E over the noise model where the closure itself was matched
+    (`Match.residual / Match.variance_m2`): its neighbours should fit about as well.
+    """
+    tolerated = settings.tolerance * float(np.clip(matched_misfit, *_MISFIT_RANGE))
+    ratios = tuple(_ratio(window, matching, settings, tolerated) for window in windows)
     return Vote(
         log_ratio=float(sum(ratios)),
         informed=sum(ratio != 0.0 for ratio in ratios),
@@ -102,7 +113,9 @@ def carried(
     return shift, covariance_m2 + walk_m2 * np.eye(2)
 
 
-def _ratio(window: VoteWindow, matching: MatchingSettings, settings: VoteSettings) -> float:
+def _ratio(
+    window: VoteWindow, matching: MatchingSettings, settings: VoteSettings, tolerated: float
+) -> float:
     problem = pair_problem(
         window.reference,
         window.query,
@@ -118,9 +131,9 @@ def _ratio(window: VoteWindow, matching: MatchingSettings, settings: VoteSetting
         return 0.0
     whole = surface.window(north, east)
     relief = relief_of(problem, surface, window.shift_m)
-    if relief is None or relief.background < _LEAST_BACKGROUND * settings.tolerance:
+    if relief is None or relief.background < _LEAST_BACKGROUND * tolerated:
         return 0.0
-    ratio = _log_ratio(whole, problem, relief, settings)
+    ratio = _log_ratio(whole, problem, relief, settings.pivot, tolerated)
     mean = float(np.log(np.sum(weight * np.exp(ratio))))
     return float(np.clip(mean, -settings.window_limit, settings.window_limit))
 
@@ -153,7 +166,7 @@ def _predicted(
 
 
 def _log_ratio(
-    surface: ErrorSurface, problem: PairProblem, relief: Relief, settings: VoteSettings
+    surface: ErrorSurface, problem: PairProblem, relief: Relief, pivot: float, tolerated: float
 ) -> Array:
     """Return the log ratio of agreement over unrelated seabed at each shift, zero without overlap.
 
@@ -161,11 +174,11 @@ def _log_ratio(
     way to the background, -N I as far beyond.
     """
     usable = np.isfinite(surface.residual_m2)
-    misfit = np.where(usable, surface.residual_m2 / surface.noise_m2, 1.0) / settings.tolerance
-    level = relief.background / settings.tolerance
-    pivot = min(np.log(settings.pivot), 0.5 * np.log(level))
-    share = 1.0 - np.log(np.maximum(misfit, 1.0)) / pivot
+    misfit = np.where(usable, surface.residual_m2 / surface.noise_m2, 1.0) / tolerated
+    level = relief.background / tolerated
+    half_way = min(np.log(pivot), 0.5 * np.log(level))
+    share = 1.0 - np.log(np.maximum(misfit, 1.0)) / half_way
     cells = np.minimum(surface.overlap_cells, relief.coherent_cells)
-    information = problem.information(noise_scale=settings.tolerance)
+    information = problem.information(noise_scale=tolerated)
     ratio = cells * information * np.maximum(share, -1.0)
     return np.where(usable, np.clip(ratio, -50.0, 50.0), 0.0)

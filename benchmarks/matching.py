@@ -1,6 +1,6 @@
 """Matching of sub-map pairs as a mission makes them: found, valid, honest, how fast.
 
-    python benchmarks/matching.py --pairs 200 --seed 1 [--relief rough,ridge] [--prior 2,10,30,60]
+    python -m benchmarks.matching --pairs 200 --seed 1 [--relief rough,ridge] [--prior 2,10,30,60]
 
 Pairs lie as in the survey: parallel strips 100 m apart (39 m of overlap) and crossings, soundings
 with 0.15 m and 0.3 % of the slant range of noise, dead reckoning with Eq. 12's random walk and

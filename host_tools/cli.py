@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 from host_tools import config_show, inspector, reproduce, simulate
 from host_tools.commands import Command
 from host_tools.processes import channel, demo, vehicle
+from host_tools.replay import gsf
 from protocol.errors import FathomError
 
 COMMANDS: tuple[Command, ...] = (
@@ -20,6 +21,7 @@ COMMANDS: tuple[Command, ...] = (
     vehicle.FOLLOWER,
     vehicle.LEADER_COMMAND,
     reproduce.COMMAND,
+    gsf.COMMAND,
     inspector.COMMAND,
     config_show.COMMAND,
 )

@@ -1,0 +1,68 @@
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from host_tools.cli import main
+from host_tools.replay.gsf import read_gsf, utm_of
+
+
+def logs() -> Path:
+    pytest.importorskip("GSFU", reason="gsfu is not installed")
+    folder = os.environ.get("FATHOMLINK_DATA")
+    if not folder:
+        pytest.skip("FATHOMLINK_DATA is not set")
+    return Path(folder) / "logs"
+
+
+def test_utm_zone_follows_longitude_and_hemisphere() -> None:
+    assert utm_of(-64.6, 17.8) == "EPSG:32620"
+    assert utm_of(3.2, -42.0) == "EPSG:32731"
+    assert utm_of(180.0, 1.0) == "EPSG:32660"
+
+
+def test_gsf_line_lies_where_and_as_deep_as_it_was_surveyed() -> None:
+    line = read_gsf(logs() / "em302_line_0059.gsf")
+    assert line.track_time_s.size == 50
+    assert line.track_time_s[-1] == pytest.approx(298, abs=2)
+    assert line.depth_m.size + line.rejected == 50 * 432
+    assert 1100 < line.depth_m.min() < line.depth_m.max() < 2400
+    length_m = np.hypot(np.diff(line.track_north_m), np.diff(line.track_east_m)).sum()
+    assert length_m == pytest.approx(1250, rel=0.05)
+    assert line.crs == "EPSG:32620"
+    course = np.arctan2(line.track_east_m[-1], line.track_north_m[-1])
+    assert np.degrees(np.abs(course - np.median(line.track_yaw_rad))) < 15
+
+
+def test_two_sides_of_the_swath_are_seen_alike_from_neighbouring_pings() -> None:
+    line = read_gsf(logs() / "em302_line_0059.gsf")
+    cell = np.round(np.stack([line.north_m, line.east_m]) / 100).astype(int)
+    _, which = np.unique(cell, axis=1, return_inverse=True)
+    count = np.bincount(which)
+    mean_m = np.bincount(which, line.depth_m) / count
+    spread_m = np.sqrt(np.bincount(which, (line.depth_m - mean_m[which]) ** 2) / count)
+    assert np.median(spread_m[count > 5]) < 40  # of 1,166 to 2,317 m, on slopes
+
+
+def test_replay_writes_what_compress_reads(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "line.npz"
+    log = logs() / "em302_line_0059.gsf"
+    assert main(["replay", str(log), "--out", str(out)]) == 0
+    assert "50 pings" in capsys.readouterr().out
+    with np.load(out) as arrays:
+        assert {"north_m", "east_m", "depth_m", "time_s", "track_yaw_rad"} <= set(arrays)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"not a log at all" * 10])
+def test_what_is_no_log_is_one_line_and_status_2(
+    content: bytes | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("GSFU", reason="gsfu is not installed")
+    path = tmp_path / "line.gsf"
+    if content is not None:
+        path.write_bytes(content)
+    assert main(["replay", str(path), "--out", str(tmp_path / "out.npz")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1

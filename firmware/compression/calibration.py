@@ -9,6 +9,7 @@ from firmware.geometry import Array
 from firmware.submaps import BinnedSoundings
 
 _ROWS = 4096  # residuals looked at: a hundred would do for two numbers, these cost 4 ms
+_TAIL = 30.0  # times the median: four sigma of a Gaussian
 _GROUPS = 8  # of cells by density, nadir to outer beams
 _SMALLEST_M2 = 1e-6
 
@@ -36,7 +37,7 @@ def calibrated(
     count = bins.count[::every]
     spread = bins.variance_m2[::every] * np.maximum(count - 1.0, 0.0)
     residual_m = bins.depth_m[::every] - depth_m
-    squared = spread + residual_m**2
+    squared = without_tail(spread + residual_m**2)
     c, sigma2 = _fitted(posterior, squared, count)
     wider = widening(squared / (c * posterior + sigma2), count)
     c, sigma2 = wider * c, wider * sigma2
@@ -65,6 +66,16 @@ def _fitted(posterior: Array, squared: Array, count: Array) -> tuple[float, floa
         elif sigma2 <= 0.0:
             c, sigma2 = right[0] / max(normal[0, 0], 1e-300), _SMALLEST_M2
     return max(float(c), _SMALLEST_M2), max(float(sigma2), _SMALLEST_M2)
+
+
+def without_tail(squared: Array) -> Array:
+    """Return squared residuals, the few wild ones held at a value that none would have by chance.
+
+    A cliff under one line of cells says nothing of the map elsewhere, and the packet has but one
+    sigma^2 for all of it.
+    """
+    out: Array = np.minimum(squared, _TAIL * max(float(np.median(squared)), _SMALLEST_M2))
+    return out
 
 
 def widening(ratio: Array, count: Array) -> float:

@@ -17,7 +17,14 @@ from numpy.typing import NDArray
 
 from firmware.compression.binning import coarsened
 from firmware.compression.calibration import calibrated
-from firmware.compression.fit import Dealing, FitFrame, FittedPoints, fit_frame, fit_steps, moved
+from firmware.compression.fit import (
+    Dealing,
+    FitFrame,
+    FittedPoints,
+    fit_frame,
+    fit_steps,
+    moved_steps,
+)
 from firmware.compression.initial import hilbert_order
 from firmware.compression.kernels import Hyperparameters
 from firmware.compression.losses import LossPatterns
@@ -104,15 +111,17 @@ def dense_code_steps(
         yield None
         if step is not None and (not packed_at or step.evaluations >= packed_at + _PACK_EVERY):
             packed_at, waiting = step.evaluations, None
-            yield _coded(step, frame, bins, deal), step
+            code = yield from _coded_steps(step, frame, bins, deal)
+            yield code, step
     if waiting is not None:
-        yield _coded(waiting, frame, bins, deal), waiting
+        code = yield from _coded_steps(waiting, frame, bins, deal)
+        yield code, waiting
     return ended
 
 
-def _coded(
+def _coded_steps(
     fitted: FittedPoints, frame: FitFrame, bins: BinnedSoundings, deal: Callable[[Array], Dealing]
-) -> DenseCode:
+) -> Generator[None, None, DenseCode]:
     """Quantise positions, fit the depths anew to where they lie now, and quantise those."""
     order = np.argsort(fitted.fragment, kind="stable")
     low = fitted.position_m.min(axis=0) + frame.origin_m
@@ -120,7 +129,8 @@ def _coded(
     step = float(np.float32(max(span / (_LEVELS - 1), 1e-4)))
     origin = np.float32(low).astype(np.float64)
     levels = np.clip(np.round((fitted.position_m + frame.origin_m - origin) / step), 0, _LEVELS)
-    fitted = moved(fitted, levels * step + origin - frame.origin_m, frame, deal)
+    at_m = levels * step + origin - frame.origin_m
+    fitted = yield from moved_steps(fitted, at_m, frame, deal)
     depth_m = fitted.depth_m + frame.mean_depth_m
     depth0 = float(np.float32(depth_m.min()))
     depth_step = float(np.float32(max(float(np.ptp(depth_m)) / (_LEVELS - 1), 1e-6)))
@@ -139,6 +149,7 @@ def _coded(
         mean_depth_m=frame.mean_depth_m,
         kernel=fitted.kernel,
     )
+    yield
     hyper, _ = calibrated(code.points_ned_m, hyper, bins)
     return dataclasses.replace(code, hyperparameters=hyper.to_wire())
 

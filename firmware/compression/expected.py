@@ -12,7 +12,7 @@ derivatives: no sampling, and two passes over the soundings whatever the number 
 """
 
 import dataclasses
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -264,3 +264,14 @@ def run(steps: Generator[None, None, T]) -> T:
         except StopIteration as stop:
             value: T = stop.value
             return value
+
+
+def stepping(steps: Generator[None, None, T]) -> Iterator[T | None]:
+    """Yield None after every small step of a generator, and its value at the end."""
+    while True:
+        try:
+            next(steps)
+        except StopIteration as stop:
+            yield stop.value
+            return
+        yield None

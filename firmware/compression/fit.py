@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware.compression.expected import Evaluation, ExpectedError, run
+from firmware.compression.expected import Evaluation, ExpectedError
 from firmware.compression.initial import Outline, dealt_fragments, initial_points
 from firmware.compression.kernels import Kernel
 from firmware.compression.lbfgs import Improvement, Trial, minimise_steps
@@ -160,8 +160,10 @@ def fit_steps(
         yield None if step is None else fitted(step)
 
 
-def moved(fitted: FittedPoints, position_m: Array, frame: FitFrame, deal: Dealer) -> FittedPoints:
-    """Return the fit with its points at other positions (M, 2) and the best depths there."""
+def moved_steps(
+    fitted: FittedPoints, position_m: Array, frame: FitFrame, deal: Dealer
+) -> Generator[None, None, FittedPoints]:
+    """Move the points to positions (M, 2); the generator's value has the best depths there."""
     problem = ExpectedError(
         frame.position_m,
         frame.depth_m,
@@ -171,7 +173,8 @@ def moved(fitted: FittedPoints, position_m: Array, frame: FitFrame, deal: Dealer
         fitted.fragment,
         frame.ridge,
     )
-    result = run(problem.steps(position_m, float(np.log(fitted.b_per_m)), gradient=False))
+    log_b = float(np.log(fitted.b_per_m))
+    result = yield from problem.steps(position_m, log_b, gradient=False)
     return dataclasses.replace(
         fitted, position_m=position_m, depth_m=result.depth_m, error_m2=result.error_m2
     )

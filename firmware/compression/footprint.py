@@ -2,6 +2,7 @@
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from firmware.compression.lattice_frame import LatticeFrame
 from firmware.geometry import Array
@@ -9,7 +10,8 @@ from firmware.submaps import BinnedSoundings
 from protocol.arithmetic import Contexts, Decoder, Encoder
 
 BLOCK_NODES = 4  # along each side; 4 m at a step of 1 m
-_FULL_ENOUGH = 0.3  # of a block's area in measured cells
+_CENTRE_REACH = 0.3  # of a block
+_SPACING_REACH = 0.9  # of the spacing that nine in ten cells keep to their neighbour
 Mask = NDArray[np.bool_]
 
 
@@ -19,12 +21,25 @@ def block_shape(frame: LatticeFrame) -> tuple[int, int]:
 
 
 def footprint(bins: BinnedSoundings, frame: LatticeFrame) -> Mask:
-    """Return which blocks were measured, (rows, columns) of blocks."""
-    inside = _block_of(frame, np.column_stack([bins.north_m, bins.east_m]))
+    """Return which blocks were measured, (rows, columns) of blocks: those whose centre was.
+
+    A centre is measured when a cell lies as near as cells lie to each other, so that the wider
+    spacing of outer beams is no gap and a gap of several spacings is one.
+    """
     shape = block_shape(frame)
-    count = np.bincount(inside[:, 0] * shape[1] + inside[:, 1], minlength=shape[0] * shape[1])
-    cells = (BLOCK_NODES * frame.step_m / bins.cell_m) ** 2
-    return np.asarray((count >= max(_FULL_ENOUGH * cells, 1.0)).reshape(shape))
+    position_m = np.column_stack([bins.north_m, bins.east_m])
+    tree = cKDTree(position_m)
+    spacing_m = np.asarray(tree.query(position_m, k=[min(2, len(position_m))])[0])
+    reach_m = max(
+        _CENTRE_REACH * BLOCK_NODES * frame.step_m,
+        _SPACING_REACH * float(np.quantile(spacing_m, 0.9)),
+    )
+    row, column = np.indices(shape).reshape(2, -1)
+    centres = np.empty((row.size, 2))
+    centres[:, 0] = BLOCK_NODES * row + 0.5 * (BLOCK_NODES - 1)
+    centres[:, 1] = BLOCK_NODES * column + 0.5 * (BLOCK_NODES - 1)
+    nearest_m = np.asarray(tree.query(frame.positions_of(centres))[0])
+    return np.asarray(nearest_m <= reach_m).reshape(shape)
 
 
 def inside_footprint(mask: Mask, frame: LatticeFrame, position_m: Array) -> Mask:
@@ -61,8 +76,3 @@ def decode_footprint(shape: tuple[int, int], decoder: Decoder) -> Mask:
 def _contexts(padded: NDArray[np.int64]) -> NDArray[np.int64]:
     west, above = padded[1:-1, :-2], padded[:-2]
     return west | above[:, :-2] << 1 | above[:, 1:-1] << 2 | above[:, 2:] << 3
-
-
-def _block_of(frame: LatticeFrame, position_m: Array) -> NDArray[np.int64]:
-    block = np.floor((frame.nodes_of(position_m) + 0.5) / BLOCK_NODES).astype(np.int64)
-    return np.clip(block, 0, np.array(block_shape(frame)) - 1)

@@ -14,7 +14,7 @@ import numpy as np
 
 from firmware.compression import bitplanes
 from firmware.compression.bitplanes import Progress
-from firmware.compression.calibration import widening
+from firmware.compression.calibration import widening, without_tail
 from firmware.compression.field import Field, Trend, fitted_field_steps, fitted_trend, surface_m
 from firmware.compression.footprint import (
     Mask,
@@ -187,7 +187,7 @@ def _residual_m2(field: Field, bins: BinnedSoundings) -> float:
     depth_m = field.trend.depth_m(field.frame.nodes_of(position_m), field.frame)
     depth_m += interpolation(field.frame, position_m) @ surface_m(field.coefficients_m).ravel()
     spread = bins.variance_m2 * np.maximum(bins.count - 1.0, 0.0)
-    squared = spread + (bins.depth_m - depth_m) ** 2
+    squared = without_tail(spread + (bins.depth_m - depth_m) ** 2)
     mean = max(float(np.average(squared, weights=bins.count)), 1e-6)
     return mean * widening(squared / mean, bins.count)
 

@@ -8,13 +8,14 @@ from numpy.typing import NDArray
 
 from firmware.compression.binning import coarsened
 from firmware.compression.calibration import calibrated
+from firmware.compression.expected import stepping
 from firmware.compression.fit import (
     FitFrame,
     FittedPoints,
     dealt_evenly,
     fit_frame,
     fit_steps,
-    moved,
+    moved_steps,
 )
 from firmware.compression.fitc_fit import fitc_steps
 from firmware.compression.initial import hilbert_order
@@ -149,8 +150,10 @@ def _pack_steps(
     mean_depth_m = float(flagged(frame.mean_depth_m, steps))
     if steps is not None:
         rounded_m = without_parity(points, steps)[:, :2] - frame.origin_m
-        fitted = moved(fitted, rounded_m, frame, dealt_evenly(PAPER_FRAGMENTS, settings))
-        yield before
+        deal = dealt_evenly(PAPER_FRAGMENTS, settings)
+        for moving in stepping(moved_steps(fitted, rounded_m, frame, deal)):
+            fitted = moving or fitted
+            yield before
         points = without_parity(_absolute(fitted, frame), steps)
     hyper = Hyperparameters(
         b_per_m=fitted.b_per_m,

@@ -5,7 +5,13 @@ import itertools
 import numpy as np
 import pytest
 
-from firmware.compression import compress, compress_steps, fragment_points, packets_from
+from firmware.compression import (
+    CompressedPoints,
+    compress,
+    compress_steps,
+    fragment_points,
+    packets_from,
+)
 from firmware.compression.settings import CompressionSettings
 from firmware.leader.reconstruction import ReconstructionSettings, reconstruct_packets
 from protocol.codec import decode, encode
@@ -70,6 +76,8 @@ def test_every_step_is_no_worse_than_the_one_before(survey: Survey) -> None:
 
 
 def test_points_of_one_fragment_are_spread_over_the_whole_map(survey: Survey) -> None:
-    for points in fragment_points(compress(survey.bins, CompressionSettings(iterations=1))):
+    compressed = compress(survey.bins, CompressionSettings(iterations=1))
+    assert isinstance(compressed, CompressedPoints)
+    for points in fragment_points(compressed):
         assert np.ptp(points[:, 0]) > 50.0
         assert np.ptp(points[:, 1]) > 80.0

@@ -1,0 +1,275 @@
+"""`fathomlink compress` and `fathomlink reconstruct`: soundings to frames to a grid, by files."""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from firmware.compression import compress, packets_from
+from firmware.compression.binning import SoundingBins
+from firmware.compression.settings import BinningSettings, CompressionSettings
+from firmware.geometry import Array
+from firmware.leader.reconstruction import ReconstructionSettings, reconstruct_packets
+from firmware.submaps import Track
+from host_tools.commands import PROFILES, Command
+from protocol.codec import decode, encode
+from protocol.errors import ConfigError, EstimationError, ProtocolError, RemoteProtocolError
+from protocol.packets import FARTHEST_M, SIZE_BYTES, Header, Profile, SubmapFragment, SubmapPacket
+from protocol.settings import replace
+
+_SOUNDINGS = ("north_m", "east_m", "depth_m", "time_s")
+_TRACK = ("track_time_s", "track_north_m", "track_east_m", "track_yaw_rad")
+_MOST_STATES = 40
+_MOST_BYTES = 1 << 20  # of a file of frames: a sub-map has 2,560
+
+
+def compress_file(
+    soundings: Path,
+    out: Path,
+    profile: str,
+    frames: int | None = None,
+    *,
+    small: bool = False,
+    settings: CompressionSettings | None = None,
+) -> str:
+    """Write a sub-map's frames, back to back, to `out`; return a line that says how it went.
+
+    Raises
+    ------
+    ConfigError
+        When the soundings cannot be read or make no sub-map, or so many frames cannot hold it.
+    """
+    columns, track = read_soundings(soundings)
+    settings = settings or CompressionSettings()
+    settings = _with_frames(settings, profile, frames, small)
+    bins = SoundingBins(BinningSettings())
+    bins.add(np.column_stack(columns[:3]), columns[3])
+    header = Header(
+        profile=Profile.SUBMAP_PAPER,
+        vehicle=1,
+        boot_epoch=0,
+        submap=0,
+        fragment=0,
+        fragment_count=10,
+        tx_second=0,
+        time_quarters=round(4.0 * float(track.time_s[0])) % (1 << 20),
+    )
+    try:
+        compressed = compress(bins.result(), settings, profile)
+        packets = packets_from(compressed, track, header)
+        data = b"".join(encode(packet) for packet in packets)
+    except (EstimationError, ProtocolError) as error:
+        raise ConfigError(f"{soundings} makes no {profile} sub-map: {error}") from error
+    _write(out, data)
+    report = compressed.report
+    return (
+        f"{bins.soundings} soundings in {len(bins.result().count)} cells, {len(packets)} frames, "
+        f"{len(data)} bytes; {bins.dropped_bad} bad and {bins.dropped_fliers} wild soundings "
+        f"dropped; fit: {report.ended} after {report.evaluations} evaluations, "
+        f"{report.failed_factorisations} failed factorisations"
+    )
+
+
+def reconstruct_file(frames: Path, out: Path, drop: set[int], cell_m: float) -> str:
+    """Write the grid of the frames that were not dropped to `out`; return a line about it.
+
+    Raises
+    ------
+    ConfigError
+        When the file holds no sub-map's frames or what remains gives no map.
+    """
+    fragments = read_frames(frames)
+    unknown = sorted(drop - set(range(max(fragments) + 1)))
+    if unknown:
+        raise ConfigError(f"--drop {unknown[0]}: {frames} has fragments 0 to {max(fragments)}")
+    kept = {index: packet for index, packet in fragments.items() if index not in drop}
+    settings = ReconstructionSettings(cell_m=cell_m)
+    try:
+        found = reconstruct_packets(kept, settings, 0.0)
+    except EstimationError as error:
+        raise ConfigError(f"{len(kept)} frames of {frames} give no map: {error}") from error
+    grid = found.grid
+    with open(out, "wb") as file:
+        rows, columns = grid.depth_m.shape
+        np.savez_compressed(
+            file,
+            north_m=grid.north0_m + grid.cell_m * np.arange(rows),
+            east_m=grid.east0_m + grid.cell_m * np.arange(columns),
+            depth_m=grid.depth_m,
+            variance_m2=grid.variance_m2,
+        )
+    good = int(np.count_nonzero(np.isfinite(grid.depth_m)))
+    return (
+        f"{len(kept)} of {len(fragments)} frames, {good} cells of {grid.cell_m:g} m; "
+        f"{found.recovered_points} points recovered from parity"
+    )
+
+
+def read_soundings(path: Path) -> tuple[list[Array], Track]:
+    """Return north, east, depth, time (N,) each, and the track, given or along the soundings.
+
+    Raises
+    ------
+    ConfigError
+        When the file is no npz of these arrays, or they disagree.
+    """
+    try:
+        with np.load(path) as data:
+            arrays = {name: np.asarray(data[name], dtype=np.float64) for name in data.files}
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}: {error.strerror or error}") from error
+    except (ValueError, KeyError, EOFError, TypeError, AttributeError) as error:
+        raise ConfigError(f"{path} is not an npz of numeric arrays: {error}") from error
+    missing = [name for name in _SOUNDINGS if name not in arrays]
+    if missing:
+        raise ConfigError(f"{path} lacks {', '.join(missing)}; needed: {', '.join(_SOUNDINGS)}")
+    columns = [arrays[name].ravel() for name in _SOUNDINGS]
+    if len({column.size for column in columns}) != 1:
+        sizes = ", ".join(str(column.size) for column in columns)
+        raise ConfigError(f"{path}: {', '.join(_SOUNDINGS)} have {sizes} values; give equally many")
+    if not np.isfinite(np.column_stack(columns)).all(axis=1).any():
+        raise ConfigError(f"{path} holds no sounding that is finite in all of its four numbers")
+    farthest_m = float(np.nanmedian(np.abs(np.concatenate(columns[:2]))))
+    if farthest_m > FARTHEST_M:
+        raise ConfigError(
+            f"{path}: coordinates of {farthest_m:.0f} m; give them from a mission datum within "
+            f"{FARTHEST_M / 1000:.0f} km, float32 on the wire steps by half a metre out there"
+        )
+    given = [name for name in _TRACK if name in arrays]
+    if given and len(given) < len(_TRACK):
+        raise ConfigError(f"{path} has {given[0]} but not all of {', '.join(_TRACK)}")
+    track = _given_track(path, arrays) if given else _track_along(columns)
+    return columns, track
+
+
+def read_frames(path: Path) -> dict[int, SubmapPacket | SubmapFragment]:
+    """Return the fragments of the one sub-map in a file of frames back to back.
+
+    Raises
+    ------
+    ConfigError
+        When there is none, or a frame is damaged or of another sub-map.
+    """
+    try:
+        data = path.read_bytes()[: _MOST_BYTES + 1]
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}: {error.strerror}") from error
+    if not data or len(data) > _MOST_BYTES:
+        raise ConfigError(f"{path} has {len(data)} bytes; give the frames of one sub-map")
+    size = SIZE_BYTES[Profile.SUBMAP_PAPER]
+    if len(data) % size or (data[0] & 31) == Profile.SUBMAP_LATTICE_SMALL:
+        size = SIZE_BYTES[Profile.SUBMAP_LATTICE_SMALL]
+    if len(data) % size:
+        raise ConfigError(f"{path} has {len(data)} bytes; frames have 256, small ones 62")
+    fragments: dict[int, SubmapPacket | SubmapFragment] = {}
+    for start in range(0, len(data), size):
+        try:
+            packet = decode(data[start : start + size])
+        except RemoteProtocolError as error:
+            raise ConfigError(f"{path}, frame {start // size}: {error}") from error
+        if not isinstance(packet, SubmapPacket | SubmapFragment):
+            raise ConfigError(f"{path}, frame {start // size} is no fragment of a sub-map")
+        fragments[packet.header.fragment] = packet
+    return fragments
+
+
+def _given_track(path: Path, arrays: dict[str, Array]) -> Track:
+    rows = [arrays[name].ravel() for name in _TRACK]
+    if len({row.size for row in rows}) != 1 or not rows[0].size:
+        raise ConfigError(f"{path}: {', '.join(_TRACK)} must have equally many values, at least 1")
+    states = np.column_stack(rows)
+    states = states[np.isfinite(states).all(axis=1)]
+    if not len(states):
+        raise ConfigError(f"{path}: no state of the track is finite")
+    states = states[np.argsort(states[:, 0], kind="stable")]
+    whole = np.unique(np.round(states[:, 0] - states[0, 0]).astype(np.int64), return_index=True)[1]
+    states = states[whole][:_MOST_STATES]
+    return Track(
+        time_s=states[:, 0], north_m=states[:, 1], east_m=states[:, 2], yaw_rad=states[:, 3]
+    )
+
+
+def _track_along(columns: list[Array]) -> Track:
+    """Return the mean position of the soundings of each second, heading along it."""
+    good = np.isfinite(np.column_stack(columns)).all(axis=1)
+    north_m, east_m, _, time_s = (column[good] for column in columns)
+    second = np.floor(time_s - time_s.min()).astype(np.int64)
+    seconds, inverse = np.unique(np.minimum(second, _MOST_STATES - 1), return_inverse=True)
+    count = np.bincount(inverse)
+    north = np.bincount(inverse, north_m) / count
+    east = np.bincount(inverse, east_m) / count
+    yaw = np.zeros(len(seconds))
+    if len(seconds) > 1:
+        yaw = np.arctan2(np.gradient(east), np.gradient(north))
+    first_s = 0.25 * np.round(4.0 * float(time_s.min()))
+    return Track(time_s=first_s + seconds, north_m=north, east_m=east, yaw_rad=yaw)
+
+
+def _with_frames(
+    settings: CompressionSettings, profile: str, frames: int | None, small: bool
+) -> CompressionSettings:
+    if small and profile != "lattice":
+        raise ConfigError("--small frames exist for --profile lattice only")
+    if frames is None:
+        frames = settings.frames if profile != "paper" else 10
+    if profile == "paper" and frames != 10:
+        raise ConfigError("--profile paper has 10 frames; --frames is for dense and lattice")
+    if not 1 <= frames <= 15:
+        raise ConfigError(f"--frames {frames}: a transfer has 1 to 15 fragments")
+    return replace(settings, {"frames": frames, "small_frames": small})
+
+
+def _write(path: Path, data: bytes) -> None:
+    try:
+        path.write_bytes(data)
+    except OSError as error:
+        raise ConfigError(f"cannot write {path}: {error.strerror}") from error
+
+
+def _configure_compress(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("soundings", type=Path, metavar="SOUNDINGS.npz")
+    parser.add_argument("--profile", choices=PROFILES, default="paper", help="default: paper")
+    parser.add_argument("--out", type=Path, required=True, metavar="FRAMES.bin")
+    parser.add_argument("--frames", type=int, metavar="N", help="dense and lattice; default: 10")
+    parser.add_argument("--small", action="store_true", help="lattice in frames of 62 bytes")
+
+
+def _configure_reconstruct(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("frames", type=Path, metavar="FRAMES.bin")
+    parser.add_argument("--drop", default="", metavar="I,J", help="fragments lost, from 0")
+    parser.add_argument("--cell", type=float, default=1.0, metavar="M", help="default: 1.0")
+    parser.add_argument("--out", type=Path, required=True, metavar="GRID.npz")
+
+
+def _run_compress(arguments: argparse.Namespace) -> None:
+    print(
+        compress_file(
+            arguments.soundings,
+            arguments.out,
+            arguments.profile,
+            arguments.frames,
+            small=arguments.small,
+        )
+    )
+
+
+def _run_reconstruct(arguments: argparse.Namespace) -> None:
+    try:
+        drop = {int(text) for text in arguments.drop.split(",") if text.strip()}
+    except ValueError as error:
+        raise ConfigError(f"--drop {arguments.drop!r} is not a list such as 2,7") from error
+    print(reconstruct_file(arguments.frames, arguments.out, drop, arguments.cell))
+
+
+COMPRESS = Command(
+    name="compress",
+    help="compress soundings to the frames of one sub-map",
+    configure=_configure_compress,
+    run=_run_compress,
+)
+RECONSTRUCT = Command(
+    name="reconstruct",
+    help="rebuild a sub-map's grid from its frames",
+    configure=_configure_reconstruct,
+    run=_run_reconstruct,
+)

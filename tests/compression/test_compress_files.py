@@ -1,0 +1,146 @@
+"""The file commands, on good soundings and on every bad input that was thought of."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware.compression.settings import CompressionSettings
+from firmware.geometry import Array
+from host_tools.compress_files import compress_file, reconstruct_file
+from protocol.errors import ConfigError
+from tests.compression.conftest import Survey, relief_m
+
+QUICK = CompressionSettings(iterations=3, dense_iterations=2)
+PROFILES = ("paper", "dense", "lattice")
+
+
+def saved(path: Path, soundings_ned_m: Array, time_s: Array | None = None) -> Path:
+    north_m, east_m, depth_m = soundings_ned_m.T
+    if time_s is None:
+        time_s = np.linspace(0.0, 39.0, len(north_m))
+    np.savez(path, north_m=north_m, east_m=east_m, depth_m=depth_m, time_s=time_s)
+    return path
+
+
+def grid_of(
+    tmp_path: Path, soundings: Path, profile: str, drop: set[int], **options: int | bool
+) -> tuple[Array, Array, Array, Array]:
+    frames, out = tmp_path / "frames.bin", tmp_path / "grid.npz"
+    compress_file(soundings, frames, profile, settings=QUICK, **options)  # type: ignore[arg-type]
+    reconstruct_file(frames, out, drop, 1.0)
+    with np.load(out) as data:
+        return data["north_m"], data["east_m"], data["depth_m"], data["variance_m2"]
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_grid_of_received_frames_is_the_seabed(
+    profile: str, survey: Survey, tmp_path: Path
+) -> None:
+    soundings = saved(tmp_path / "s.npz", survey.soundings_ned_m, survey.time_s)
+    north_m, east_m, depth_m, variance_m2 = grid_of(tmp_path, soundings, profile, {2, 7})
+    error_m = depth_m - relief_m(*np.meshgrid(north_m, east_m, indexing="ij"))
+    assert np.sqrt(np.nanmean(error_m**2)) < 0.2  # m, of a relief of 1.3 m standard deviation
+    assert np.array_equal(np.isnan(depth_m), np.isnan(variance_m2))
+    assert np.isfinite(depth_m).mean() > 0.8
+    assert np.nanmax(variance_m2) <= 0.1
+
+
+def test_two_lattice_frames_hold_the_map(survey: Survey, tmp_path: Path) -> None:
+    soundings = saved(tmp_path / "s.npz", survey.soundings_ned_m, survey.time_s)
+    north_m, east_m, depth_m, _ = grid_of(tmp_path, soundings, "lattice", set(), frames=2)
+    error_m = depth_m - relief_m(*np.meshgrid(north_m, east_m, indexing="ij"))
+    assert np.sqrt(np.nanmean(error_m**2)) < 0.1
+    assert (tmp_path / "frames.bin").stat().st_size == 512
+
+
+def test_small_frames_of_62_bytes_hold_a_lattice(survey: Survey, tmp_path: Path) -> None:
+    soundings = saved(tmp_path / "s.npz", survey.soundings_ned_m, survey.time_s)
+    north_m, east_m, depth_m, _ = grid_of(tmp_path, soundings, "lattice", {4}, small=True)
+    error_m = depth_m - relief_m(*np.meshgrid(north_m, east_m, indexing="ij"))
+    assert np.sqrt(np.nanmean(error_m**2)) < 0.3
+    assert (tmp_path / "frames.bin").stat().st_size == 620
+
+
+# every depth is then less certain than the 0.1 m2 that the leader keeps
+UNCERTAIN = {"fewer soundings than points", "millimetres across", "cliff of 40 m"}
+
+
+def bad_inputs() -> dict[str, Array]:
+    rng = np.random.default_rng(0)
+    area = rng.uniform([-40.0, -60.0], [40.0, 60.0], (4000, 2))
+    noise_m = 0.1 * rng.normal(size=4000)
+    flat = np.column_stack([area, np.full(4000, 40.0)])
+    rough = np.column_stack([area, relief_m(*area.T) + noise_m])
+    broken = rough.copy()
+    broken[::3, 2] = np.nan
+    wild = rough.copy()
+    wild[::20, 2] += rng.uniform(-30.0, 30.0, 200)
+    apart = rough.copy()
+    apart[2000:, 0] += 10_000.0
+    return {
+        "fewer soundings than points": rough[:60],
+        "constant depth without noise": flat,
+        "cliff of 40 m": np.column_stack([area, np.where(area[:, 0] > 3.0, 20.0, 60.0)]),
+        "step of 3 m": np.column_stack([area, np.where(area[:, 0] > 3.0, 40.0, 43.0)]),
+        "one in three is NaN": broken,
+        "one in twenty is wild": wild,
+        "two places 10 km apart": apart,
+        "hole in the middle": rough[np.hypot(*area.T) > 25.0],
+        "millimetres across": rough * np.array([1e-4, 1e-4, 1.0]),
+    }
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("name", bad_inputs())
+def test_awkward_soundings_give_frames_and_a_grid_or_one_clear_error(
+    name: str, profile: str, tmp_path: Path
+) -> None:
+    soundings = saved(tmp_path / "s.npz", bad_inputs()[name])
+    if name == "two places 10 km apart" and profile != "paper":
+        with pytest.raises(ConfigError, match="track"):
+            grid_of(tmp_path, soundings, profile, set())
+        return
+    _, _, depth_m, _ = grid_of(tmp_path, soundings, profile, set())
+    finite = depth_m[np.isfinite(depth_m)]
+    assert (finite.size > 0) != (name in UNCERTAIN)
+    assert np.all((finite > 0.0) & (finite < 90.0))
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_one_line_of_soundings_is_told_from_a_map(profile: str, tmp_path: Path) -> None:
+    along = np.linspace(-40.0, 40.0, 3000)
+    line = np.column_stack([along, np.zeros(3000), relief_m(along, np.zeros(3000))])
+    soundings = saved(tmp_path / "s.npz", line)
+    if profile != "lattice":
+        with pytest.raises(ConfigError, match="line"):
+            grid_of(tmp_path, soundings, profile, set())
+        return
+    _, _, depth_m, _ = grid_of(tmp_path, soundings, profile, set())
+    assert np.isfinite(depth_m).sum() < 1000  # no more than the blocks along it
+
+
+@pytest.mark.parametrize(
+    ("soundings", "complaint"),
+    [
+        (np.array([[4_600_000.0, 330_000.0, 20.0]] * 9), "mission datum"),
+        (np.full((9, 3), np.nan), "no sounding that is finite"),
+        (np.array([[1.0, 2.0, 20.0]] * 9), "usable cells"),
+    ],
+)
+def test_soundings_of_which_no_map_can_be_made_are_refused(
+    soundings: Array, complaint: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ConfigError, match=complaint):
+        compress_file(saved(tmp_path / "s.npz", soundings), tmp_path / "f.bin", "paper")
+
+
+def test_files_that_hold_something_else_are_refused(tmp_path: Path) -> None:
+    text = tmp_path / "text.npz"
+    text.write_text("no arrays here")
+    with pytest.raises(ConfigError, match="not an npz"):
+        compress_file(text, tmp_path / "f.bin", "paper")
+    with pytest.raises(ConfigError, match="cannot read"):
+        compress_file(tmp_path / "nowhere.npz", tmp_path / "f.bin", "paper")
+    with pytest.raises(ConfigError, match="bytes"):
+        reconstruct_file(text, tmp_path / "g.npz", set(), 1.0)

@@ -1,17 +1,25 @@
 """A finished mission's nodes as the values that the evaluation reads."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from firmware.geometry import Array
 from firmware.leader.closures import Closure
 from firmware.leader.core import LeaderCore
+from firmware.leader.trajectory import Trajectory
 from host_tools.mapping import DepthMap
 from host_tools.mission_settings import MissionSettings
-from host_tools.nodes import BeliefLog, FollowerNode, LeaderNode
+from host_tools.nodes import FollowerNode, LeaderNode
 from host_tools.patches import patch_of_grid
-from host_tools.results import ClosureResult, MissionResult, SoundingPatch, VehicleResult
+from host_tools.results import (
+    ClosureResult,
+    Counters,
+    MissionResult,
+    SoundingPatch,
+    VehicleResult,
+)
 from host_tools.simulator.placement import Site, Window
 from host_tools.simulator.vehicle import SimulatedVehicle
 from protocol.acoustics import Delivery
@@ -21,6 +29,30 @@ from protocol.settings import flatten
 # Covariances are asked for this often: they change slowly and cost a solve each.
 COVARIANCE_STEP = 20
 COVARIANCES_AT_ONCE = 16
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LeaderRecord:
+    """What the leader holds at the end: trajectories by vehicle, closures, and its sheets.
+
+    covariances_m2 are (T, 2, 2) on the mission's 1 Hz grid. patches is read once.
+    """
+
+    trajectories: Mapping[int, Trajectory]
+    covariances_m2: Mapping[int, Array]
+    closures: Sequence[ClosureResult]
+    patches: Iterable[SoundingPatch]
+
+
+def leader_record(leader: LeaderCore, time_s: Array, window: Window) -> LeaderRecord:
+    """Return what a leader holds."""
+    vehicles = leader.vehicles()
+    return LeaderRecord(
+        trajectories={vehicle: leader.trajectory(vehicle) for vehicle in vehicles},
+        covariances_m2={v: final_covariances(v, time_s, leader) for v in vehicles},
+        closures=[closure_result(closure) for closure in leader.closures],
+        patches=sheet_patches(leader, window),
+    )
 
 
 def mission_result(
@@ -34,8 +66,37 @@ def mission_result(
     deliveries: Sequence[Delivery],
     truth_map: DepthMap,
 ) -> MissionResult:
-    """Return what a mission came to, as the leader sees it at the end."""
-    logs = [leader.log, *(node.log for node in followers)]
+    """Return what a mission in this process came to, as the leader sees it at the end."""
+    return result_of_record(
+        settings,
+        site,
+        seed,
+        baseline,
+        vehicles,
+        [leader.log.columns(), *(node.log.columns() for node in followers)],
+        leader_record(leader.core, vehicles[0].true_track().time_s, site.window),
+        {
+            "leader": leader.core.status(),
+            **{f"follower_{node.core.vehicle}": node.core.status() for node in followers},
+        },
+        deliveries,
+        truth_map,
+    )
+
+
+def result_of_record(
+    settings: MissionSettings,
+    site: Site,
+    seed: int,
+    baseline: str,
+    vehicles: Sequence[SimulatedVehicle],
+    beliefs: Sequence[Mapping[str, Array]],
+    record: LeaderRecord,
+    counters: Mapping[str, Counters],
+    deliveries: Sequence[Delivery],
+    truth_map: DepthMap,
+) -> MissionResult:
+    """Return what a mission came to, from each vehicle's beliefs and the leader's record."""
     return MissionResult(
         scenario=settings.scenario,
         site=site,
@@ -43,32 +104,29 @@ def mission_result(
         profile=settings.follower.profile,
         baseline=baseline,
         vehicles=[
-            vehicle_result(vehicle, log, leader.core)
-            for vehicle, log in zip(vehicles, logs, strict=True)
+            vehicle_result(vehicle, columns, record)
+            for vehicle, columns in zip(vehicles, beliefs, strict=True)
         ],
-        closures=[closure_result(closure) for closure in leader.core.closures],
+        closures=record.closures,
         deliveries=deliveries,
-        patches=sheet_patches(leader.core, site.window),
+        patches=record.patches,
         truth_map=truth_map,
-        counters={
-            "leader": leader.core.status(),
-            **{f"follower_{node.core.vehicle}": node.core.status() for node in followers},
-        },
+        counters=counters,
         settings={key: value for key, value, *_ in flatten(settings)},
     )
 
 
-def vehicle_result(vehicle: SimulatedVehicle, log: BeliefLog, leader: LeaderCore) -> VehicleResult:
+def vehicle_result(
+    vehicle: SimulatedVehicle, columns: Mapping[str, Array], record: LeaderRecord
+) -> VehicleResult:
     """Return one vehicle's tracks on the mission's 1 Hz grid.
 
     Where the leader never heard of a vehicle, its dead reckoning is all that is known of it.
     """
-    truth, columns = vehicle.true_track(), log.columns()
-    reckoned_m = columns["reckoned_m"]
-    final_m, covariance_m2 = reckoned_m, None
-    if vehicle.index in leader.vehicles():
-        final_m = leader.trajectory(vehicle.index).correct(truth.time_s, reckoned_m)
-        covariance_m2 = final_covariances(vehicle.index, truth.time_s, leader)
+    truth, reckoned_m = vehicle.true_track(), columns["reckoned_m"]
+    final_m = reckoned_m
+    if vehicle.index in record.trajectories:
+        final_m = record.trajectories[vehicle.index].correct(truth.time_s, reckoned_m)
     return VehicleResult(
         vehicle=vehicle.index,
         truth=truth,
@@ -77,7 +135,7 @@ def vehicle_result(vehicle: SimulatedVehicle, log: BeliefLog, leader: LeaderCore
         final_m=final_m,
         yaw_rad=columns["yaw_rad"],
         live_covariance_m2=columns["live_covariance_m2"],
-        final_covariance_m2=covariance_m2,
+        final_covariance_m2=record.covariances_m2.get(vehicle.index),
     )
 
 

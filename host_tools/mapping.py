@@ -46,6 +46,15 @@ class DepthMap:
         for k, term in enumerate(terms):
             box[k] += np.bincount(cell, term, shape[0] * shape[1]).reshape(shape)
 
+    @property
+    def sums(self) -> NDArray[np.float64]:
+        """What was gathered, (4, rows, columns): count, and sums of weight, depth and square."""
+        return self._sums
+
+    def add_sums(self, sums: NDArray[np.float64]) -> None:
+        """Add what another map of the same window has gathered."""
+        self._sums += sums
+
     def grids(self, fill_m: float = 0.0) -> tuple[Array, Array]:
         """Return depth and standard deviation (rows, columns), NaN where nothing was measured.
 

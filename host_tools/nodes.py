@@ -14,35 +14,46 @@ from firmware.soundings import Odometry, Ping
 Steps = Iterator[tuple[Odometry, Ping | None]]
 
 
+Row = tuple[float, ...]
+ROW_NUMBERS = 10
+
+
+def belief_row(belief: Belief, reckoned: ReckonedState) -> Row:
+    """Return one second of a belief log."""
+    return (
+        belief.time_s,
+        *belief.position_m,
+        *belief.covariance_m2.ravel(),
+        reckoned.north_m,
+        reckoned.east_m,
+        reckoned.yaw_rad,
+    )
+
+
+def belief_columns(rows: np.ndarray) -> dict[str, np.ndarray]:
+    """Return time_s (T,), live_m (T, 2), covariance_m2 (T, 2, 2), reckoned_m, yaw_rad of rows."""
+    return {
+        "time_s": rows[:, 0],
+        "live_m": rows[:, 1:3],
+        "live_covariance_m2": rows[:, 3:7].reshape(-1, 2, 2),
+        "reckoned_m": rows[:, 7:9],
+        "yaw_rad": rows[:, 9],
+    }
+
+
 class BeliefLog:
     """What a vehicle believed of itself at each whole second, beside raw dead reckoning."""
 
     def __init__(self) -> None:
-        self._rows: list[tuple[float, ...]] = []
+        self._rows: list[Row] = []
 
     def note(self, belief: Belief, reckoned: ReckonedState) -> None:
         """Keep one second."""
-        self._rows.append(
-            (
-                belief.time_s,
-                *belief.position_m,
-                *belief.covariance_m2.ravel(),
-                reckoned.north_m,
-                reckoned.east_m,
-                reckoned.yaw_rad,
-            )
-        )
+        self._rows.append(belief_row(belief, reckoned))
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Return time_s (T,), live_m (T, 2), covariance_m2 (T, 2, 2), reckoned_m, yaw_rad."""
-        rows = np.array(self._rows)
-        return {
-            "time_s": rows[:, 0],
-            "live_m": rows[:, 1:3],
-            "live_covariance_m2": rows[:, 3:7].reshape(-1, 2, 2),
-            "reckoned_m": rows[:, 7:9],
-            "yaw_rad": rows[:, 9],
-        }
+        """Return the columns of the seconds kept."""
+        return belief_columns(np.array(self._rows))
 
 
 class Node(Protocol):

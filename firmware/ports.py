@@ -1,0 +1,91 @@
+"""What both loops do with their ports: read the modem, read the sensors, write the modem."""
+
+import logging
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from typing import Protocol
+
+from firmware.soundings import Odometry, Ping
+from protocol.modems.base import Modem, Reception
+
+LOG = logging.getLogger(__name__)
+SensorStep = tuple[Odometry, Ping | None]
+_SAME_INSTANT_S = 1e-6
+
+
+class Navigator(Protocol):
+    """The part of a core that takes what the sensors say."""
+
+    def receive_odometry(self, odometry: Odometry) -> None:
+        """Take navigation."""
+
+    def receive_ping(self, ping: Ping) -> None:
+        """Take a ping."""
+
+
+class SensorPort:
+    """Hands a core the sensors' steps as their times come."""
+
+    def __init__(self, steps: Iterator[SensorStep]) -> None:
+        self._steps = steps
+        self._waiting: SensorStep | None = None
+
+    def feed(self, core: Navigator, now_s: float) -> None:
+        """Give the core every step up to and including now."""
+        while (step := self._next(now_s)) is not None:
+            odometry, ping = step
+            core.receive_odometry(odometry)
+            if ping is not None:
+                core.receive_ping(ping)
+
+    def _next(self, now_s: float) -> SensorStep | None:
+        step = self._waiting if self._waiting is not None else next(self._steps, None)
+        if step is not None and step[0].time_s > now_s + _SAME_INSTANT_S:
+            self._waiting = step
+            return None
+        self._waiting = None
+        return step
+
+
+class ModemPort:
+    """Moves frames between a modem and a core, and counts what the link did meanwhile."""
+
+    def __init__(self, modem: Modem) -> None:
+        self._modem = modem
+        self.counters: Counter[str] = Counter()
+        self.notices: deque[str] = deque(maxlen=20)  # for the status; older ones are in the log
+
+    def hear(self, receive: Callable[[Reception], None], now_s: float) -> None:
+        """Give every frame that came to the core."""
+        self._modem.poll(now_s)
+        while (event := self._modem.next_event()) is not None:
+            if isinstance(event, Reception):
+                receive(event)
+            else:
+                self.counters["link_notices"] += 1
+                self.notices.append(event.text)
+                LOG.warning("%.2f s: %s", event.at_s, event.text)
+
+    def speak(self, poll: Callable[[float], bytes | None], now_s: float) -> None:
+        """Send the core's frame of this instant.
+
+        While the port is away the core is not asked: a frame that waits in a queue would leave
+        with a time of transmission that is no longer true, and its range would be wrong.
+        """
+        if self._modem.status().is_up:
+            frame = poll(now_s)
+            if frame is not None:
+                self._modem.send(frame, now_s)
+        self._modem.poll(now_s)
+
+    def status(self) -> dict[str, int]:
+        """Return the link's counters."""
+        status = self._modem.status()
+        return {
+            **self.counters,
+            "modem_sent": status.sent,
+            "modem_received": status.received,
+            "modem_dropped": status.dropped_in + status.dropped_out,
+            "modem_discarded": status.discarded,
+            "modem_reopened": status.reopened,
+        }

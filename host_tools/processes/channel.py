@@ -1,0 +1,205 @@
+"""`fathomlink channel`: the water between vehicles' processes, and their clock."""
+
+import argparse
+import shlex
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Never
+
+from tqdm import tqdm
+
+from host_tools.collect import result_of_record
+from host_tools.commands import Command
+from host_tools.evaluation import evaluate
+from host_tools.mapping import DepthMap
+from host_tools.mission import Progress, run, simulated_vehicles, water_between
+from host_tools.processes.fleet import Fleet, OnWait
+from host_tools.processes.records import VehicleFiles
+from host_tools.processes.remote_node import RemoteNode
+from host_tools.processes.voyage import Voyage, add_voyage_arguments, voyage_of
+from host_tools.report import write_report
+from host_tools.results import MissionResult
+from host_tools.simulate import outcome_lines
+from host_tools.simulator.vehicle import SimulatedVehicle
+from host_tools.writers import prepare_folder, write_outputs
+from protocol.acoustics import Delivery
+
+Ready = Callable[[Fleet], None]
+
+
+def host_mission(
+    voyage: Voyage,
+    out: Path,
+    *,
+    ready: Ready,
+    on_wait: OnWait,
+    progress: Progress,
+    ports: Path | None = None,
+    pace: "Pace | None" = None,
+) -> MissionResult:
+    """Return a mission whose vehicles are processes, from the files that they leave in out.
+
+    ready is called when the ports are there; on_wait while processes are missing.
+    """
+    vehicles = simulated_vehicles(voyage.settings, voyage.site, voyage.seed)
+    water = water_between(voyage.settings, vehicles, voyage.seed)
+    files = {vehicle: VehicleFiles(out, vehicle) for vehicle in water.nodes}
+    for each in files.values():
+        each.forget()
+    deliveries: list[Delivery] = []
+    with Fleet(
+        water,
+        voyage.fingerprint,
+        on_wait=on_wait,
+        folder=ports,
+        is_overdue=pace.is_over if pace is not None else lambda _: False,
+    ) as fleet:
+        ready(fleet)
+        fleet.wait_for_all()
+        if pace is not None:
+            pace.start()
+        run(
+            fleet.nodes,
+            water,
+            duration_s=voyage.settings.scenario.duration_s,
+            tick_s=voyage.tick_s,
+            record=deliveries.append,
+            progress=progress if pace is None else pace.after(progress),
+        )
+        fleet.end()
+        lines = {f"line_{node.name}": node.status() for node in fleet.nodes.values()}
+    return _result(voyage, vehicles, files, deliveries, lines)
+
+
+def _result(
+    voyage: Voyage,
+    vehicles: Sequence[SimulatedVehicle],
+    files: dict[int, VehicleFiles],
+    deliveries: list[Delivery],
+    lines: dict[str, dict[str, int]],
+) -> MissionResult:
+    truth_map = DepthMap(voyage.site.window)
+    for each in files.values():
+        each.add_soundings(truth_map)
+    return result_of_record(
+        voyage.settings,
+        voyage.site,
+        voyage.seed,
+        "none",
+        vehicles,
+        [files[v.index].beliefs(v.true_track().time_s) for v in vehicles],
+        files[0].record(),
+        {**{each.name: each.counters() for each in files.values()}, **lines},
+        deliveries,
+        truth_map,
+    )
+
+
+class Pace:
+    """Real time: every tick lasts as long on the wall as in the mission."""
+
+    def __init__(self, tick_s: float) -> None:
+        self._tick_s, self._began_s = tick_s, 0.0
+
+    def start(self) -> None:
+        """Let mission time 0 be now."""
+        self._began_s = time.monotonic()
+
+    def is_over(self, now_s: float) -> bool:
+        """Return whether the tick's own time is up: a vehicle that has not answered is late."""
+        return time.monotonic() - self._began_s >= now_s + self._tick_s
+
+    def after(self, progress: Progress) -> Progress:
+        """Return progress, followed by a wait for the end of the tick."""
+
+        def wait(now_s: float) -> None:
+            progress(now_s)
+            time.sleep(max(0.0, self._began_s + now_s + self._tick_s - time.monotonic()))
+
+        return wait
+
+
+def vehicle_command(fleet: Fleet, node: RemoteNode, voyage: Voyage, out: Path) -> list[str]:
+    """Return the arguments after `fathomlink` that start a vehicle's process."""
+    name = ["leader"] if node.vehicle == 0 else ["follower", "--vehicle", str(node.vehicle)]
+    ports = ["--modem", fleet.modem_url(node.vehicle), "--clock", fleet.clock_url]
+    return [*name, *ports, "--out", str(out), *voyage.arguments]
+
+
+def advance(bar: "tqdm[Never]", now_s: float) -> None:
+    """Move a bar of seconds."""
+    if now_s - bar.n >= 1.0:
+        bar.update(int(now_s) - bar.n)
+
+
+def finish(result: MissionResult, out: Path, *, report: bool = True) -> list[str]:
+    """Write everything of the contract; return the table of errors."""
+    evaluation = evaluate(result)
+    write_outputs(result, evaluation, out)
+    if report:
+        write_report(result, evaluation, out / "report.html")
+    return outcome_lines(evaluation)
+
+
+class WaitNotice:
+    """Says once, each time, which processes are missing and how to start them."""
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say = say
+        self._said: list[str] = []
+
+    def __call__(self, missing: Sequence[RemoteNode]) -> None:
+        """Tell of those that are missing now."""
+        names = [node.name for node in missing]
+        if names != self._said and names:
+            at = f"the clock stands still at {missing[0].now_s:g} s: "
+            self._say(f"{at}waiting for {', '.join(names)}")
+        self._said = names
+
+
+def _configure(parser: argparse.ArgumentParser) -> None:
+    add_voyage_arguments(parser)
+    parser.add_argument(
+        "--real-time", action="store_true", help="follow the wall clock; default: virtual time"
+    )
+    parser.add_argument(
+        "--ports", type=Path, metavar="DIR", help="where the ports' names go (default: /tmp)"
+    )
+    parser.add_argument("--out", type=Path, default=Path("out/channel"), metavar="DIR")
+    parser.add_argument("--no-report", action="store_true", help="leave report.html out")
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    out = prepare_folder(arguments.out)
+    voyage = voyage_of(arguments)
+
+    def ready(fleet: Fleet) -> None:
+        print("the ports are open; start each vehicle in a terminal of its own:")
+        for node in fleet.nodes.values():
+            print(f"\n{node.name} at {node.port.name}:")
+            print("  fathomlink " + shlex.join(vehicle_command(fleet, node, voyage, out)))
+        print(flush=True)
+
+    total_s = round(voyage.settings.scenario.duration_s)
+    with tqdm(total=total_s, unit="s", desc="mission", leave=False, disable=None) as bar:
+        result = host_mission(
+            voyage,
+            out,
+            ready=ready,
+            on_wait=WaitNotice(lambda line: tqdm.write(line, file=sys.stderr)),
+            progress=lambda now_s: advance(bar, now_s),
+            ports=arguments.ports,
+            pace=Pace(voyage.tick_s) if arguments.real_time else None,
+        )
+    print("\n".join(finish(result, out, report=not arguments.no_report)))
+    print(f"outputs in {out}")
+
+
+COMMAND = Command(
+    name="channel",
+    help="make ports, and be the water and the clock between the vehicles on them",
+    configure=_configure,
+    run=_run,
+)

@@ -1,0 +1,136 @@
+"""What each vehicle's process writes, and the evaluation reads when the mission is over.
+
+In `processes/` under --out, per vehicle: `NAME.beliefs`, rows of ten little-endian doubles, one a
+second, appended as they come, so that a killed process leaves all but its last; `NAME.json`,
+counters; `NAME.soundings.npz`, what the simulated sonar measured, placed by true navigation, for
+the map's truth; and of the leader `leader.npz`, its trajectories, closures and sheets.
+"""
+
+import dataclasses
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from firmware.belief import Belief
+from firmware.dead_reckoning import ReckonedState
+from firmware.geometry import Array
+from firmware.leader.trajectory import Trajectory
+from host_tools.collect import LeaderRecord
+from host_tools.mapping import DepthMap
+from host_tools.nodes import ROW_NUMBERS, belief_columns, belief_row
+from host_tools.results import ClosureResult, Counters, SoundingPatch
+from protocol.errors import ConfigError
+
+FOLDER = "processes"
+_ROW_BYTES = 8 * ROW_NUMBERS
+_PATCH = ("north_m", "east_m", "depth_m", "variance_m2", "time_s")
+_TRAJECTORY = tuple(field.name for field in dataclasses.fields(Trajectory))
+
+
+def name_of(vehicle: int) -> str:
+    """Return the vehicle's name in files."""
+    return "leader" if vehicle == 0 else f"follower_{vehicle}"
+
+
+class VehicleFiles:
+    """The files of one vehicle's process."""
+
+    def __init__(self, out: Path, vehicle: int) -> None:
+        self.folder, self.name = out / FOLDER, name_of(vehicle)
+
+    def prepare(self) -> int:
+        """Make the folder and return how often this vehicle has started before in it."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        path = self._path("starts")
+        starts = int(path.read_text(encoding="ascii")) if path.exists() else 0
+        path.write_text(str(starts + 1), encoding="ascii")
+        return starts
+
+    def forget(self) -> None:
+        """Remove what an earlier mission left."""
+        for suffix in ("starts", "beliefs", "json", "soundings.npz", "npz"):
+            self._path(suffix).unlink(missing_ok=True)
+
+    def note(self, belief: Belief, reckoned: ReckonedState) -> None:
+        """Append one second to the beliefs."""
+        row = np.array(belief_row(belief, reckoned), dtype="<f8")
+        with self._path("beliefs").open("ab") as stream:
+            stream.write(row.tobytes())
+
+    def beliefs(self, time_s: Array) -> dict[str, np.ndarray]:
+        """Return the columns of the beliefs on the grid time_s (T,), gaps interpolated.
+
+        Raises
+        ------
+        ConfigError
+            When there is none, or hardly any.
+        """
+        data = self._path("beliefs").read_bytes() if self._path("beliefs").exists() else b""
+        rows = np.frombuffer(data[: len(data) // _ROW_BYTES * _ROW_BYTES], dtype="<f8")
+        by_time = {float(row[0]): row for row in rows.reshape(-1, ROW_NUMBERS)}
+        if len(by_time) < 2:
+            raise ConfigError(f"{self._path('beliefs')} holds no mission; start {self.name} anew")
+        known = np.array([by_time[t] for t in sorted(by_time)])
+        columns = [np.interp(time_s, known[:, 0], known[:, k]) for k in range(ROW_NUMBERS)]
+        return belief_columns(np.stack(columns, axis=1))
+
+    def write_counters(self, counters: Counters) -> None:
+        """Write the counters."""
+        self._path("json").write_text(json.dumps(counters, indent=1) + "\n", encoding="ascii")
+
+    def counters(self) -> dict[str, float]:
+        """Return the counters."""
+        counters: dict[str, float] = json.loads(self._path("json").read_text(encoding="ascii"))
+        return counters
+
+    def write_soundings(self, truth_map: DepthMap) -> None:
+        """Write what the sonar measured."""
+        np.savez(self._path("soundings.npz"), sums=truth_map.sums)
+
+    def add_soundings(self, truth_map: DepthMap) -> None:
+        """Add what the sonar measured to a map."""
+        with np.load(self._path("soundings.npz")) as arrays:
+            truth_map.add_sums(arrays["sums"])
+
+    def write_record(self, record: LeaderRecord) -> None:
+        """Write what the leader holds."""
+        arrays: dict[str, Any] = {}
+        for vehicle, trajectory in record.trajectories.items():
+            for field in _TRAJECTORY:
+                arrays[f"trajectory.{vehicle}.{field}"] = getattr(trajectory, field)
+            arrays[f"covariances.{vehicle}"] = record.covariances_m2[vehicle]
+        for k, patch in enumerate(record.patches):
+            columns = np.stack([getattr(patch, field) for field in _PATCH])
+            arrays[f"patch.{patch.vehicle}.{k}"] = columns
+        closures = [dataclasses.asdict(closure) for closure in record.closures]
+        np.savez(self._path("npz"), closures=np.array(json.dumps(closures)), **arrays)
+
+    def record(self) -> LeaderRecord:
+        """Return what the leader holds."""
+        with np.load(self._path("npz")) as arrays:
+            vehicles = [int(k.split(".")[1]) for k in arrays.files if k.startswith("covariances.")]
+            return LeaderRecord(
+                trajectories={v: _trajectory(arrays, v) for v in vehicles},
+                covariances_m2={v: arrays[f"covariances.{v}"] for v in vehicles},
+                closures=[
+                    ClosureResult(**closure) for closure in json.loads(str(arrays["closures"]))
+                ],
+                patches=self._patches(),
+            )
+
+    def _patches(self) -> Iterator[SoundingPatch]:
+        with np.load(self._path("npz")) as arrays:
+            for key in arrays.files:
+                if key.startswith("patch."):
+                    columns = dict(zip(_PATCH, arrays[key], strict=True))
+                    yield SoundingPatch(vehicle=int(key.split(".")[1]), **columns)
+
+    def _path(self, suffix: str) -> Path:
+        return self.folder / f"{self.name}.{suffix}"
+
+
+def _trajectory(arrays: Mapping[str, np.ndarray], vehicle: int) -> Trajectory:
+    return Trajectory(**{field: arrays[f"trajectory.{vehicle}.{field}"] for field in _TRAJECTORY})

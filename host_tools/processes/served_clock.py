@@ -1,0 +1,158 @@
+"""A vehicle's end of the channel: a clock that is served, and a modem with times of arrival."""
+
+import socket
+import time
+from collections import Counter, deque
+from collections.abc import Iterator
+from pathlib import Path
+
+from host_tools.processes.control import Advance, Arrival, ControlLine, Done, End, Hello, Refused
+from protocol.crc import crc32c
+from protocol.errors import ConfigError, ModemUnavailable
+from protocol.modems.base import Modem, ModemEvent, ModemStatus, Reception
+
+HANDOVER_S = 2.0
+"""Of real time: a kernel that has not passed bytes on by then has lost them."""
+NAP_S = 0.0002
+CLOCK_SCHEME = "unix://"
+
+
+class StampedModem:
+    """A raw line beside the channel's word on when each frame's first bit arrived."""
+
+    def __init__(self, line: Modem) -> None:
+        self._line = line
+        self._expected: deque[Arrival] = deque()
+        self._events: deque[ModemEvent] = deque()
+        self._written: deque[int] = deque()
+        self._told = 0
+        self.counters: Counter[str] = Counter()
+
+    @property
+    def largest_frame_bytes(self) -> int:
+        """The longest frame that the line carries whole."""
+        return self._line.largest_frame_bytes
+
+    def send(self, frame: bytes, now_s: float) -> None:
+        """Write a frame to the line."""
+        self._written.append(crc32c(frame))
+        self._line.send(frame, now_s)
+
+    def poll(self, now_s: float) -> None:
+        """Move bytes."""
+        self._line.poll(now_s)
+
+    def next_event(self) -> ModemEvent | None:
+        """Return the oldest event not yet fetched, or None."""
+        return self._events.popleft() if self._events else None
+
+    def status(self) -> ModemStatus:
+        """Return the line's counters."""
+        return self._line.status()
+
+    def close(self) -> None:
+        """Give the port back."""
+        self._line.close()
+
+    def collect(self, arrivals: tuple[Arrival, ...], now_s: float) -> tuple[int, ...]:
+        """Take the announced frames from the line; return the CRCs of those that did not come.
+
+        A frame that nobody announced is foreign traffic: the core gets it without an arrival.
+        """
+        waiting = list(arrivals)
+        heard: dict[int, Reception] = {}
+        give_up_s = time.monotonic() + HANDOVER_S
+        while True:
+            self._line.poll(now_s)
+            while (event := self._line.next_event()) is not None:
+                if not isinstance(event, Reception):
+                    self._events.append(event)
+                    continue
+                arrival = _taken(waiting, crc32c(event.frame))
+                if arrival is None:
+                    self.counters["foreign_frames"] += 1
+                    self._events.append(
+                        Reception(frame=event.frame, toa_s=None, heard_s=event.heard_s)
+                    )
+                    continue
+                heard[id(arrival)] = Reception(
+                    frame=event.frame, toa_s=arrival.toa_s, heard_s=arrival.heard_s
+                )
+            if not waiting or not self._line.status().is_up or time.monotonic() > give_up_s:
+                break
+            time.sleep(NAP_S)
+        self._events.extend(heard[id(a)] for a in arrivals if id(a) in heard)
+        return tuple(arrival.crc for arrival in waiting)
+
+    def frames_written(self) -> tuple[int, ...]:
+        """Return the CRCs of the frames that the operating system took since the last call."""
+        sent = self._line.status().sent
+        count, self._told = sent - self._told, sent
+        return tuple(self._written.popleft() for _ in range(min(count, len(self._written))))
+
+
+def _taken(waiting: list[Arrival], crc: int) -> Arrival | None:
+    for k, arrival in enumerate(waiting):
+        if arrival.crc == crc:
+            return waiting.pop(k)
+    return None
+
+
+class ServedClock:
+    """Time as the channel serves it; it ends when the channel says so.
+
+    Raises
+    ------
+    ModemUnavailable
+        When there is no channel at the address, or it goes.
+    ConfigError
+        When the channel refuses this vehicle.
+    """
+
+    def __init__(self, url: str, vehicle: int, mission: str, modem: StampedModem) -> None:
+        self._url, self._modem = url, modem
+        self._now_s = 0.0
+        self._line = _connect(url)
+        self._line.send(Hello(vehicle=vehicle, mission=mission))
+
+    def now_s(self) -> float:
+        """Return the served time."""
+        return self._now_s
+
+    def ticks(self, period_s: float) -> Iterator[float]:
+        """Yield the times that the channel serves, which have its own period."""
+        del period_s
+        while True:
+            if not self._line.is_open:
+                raise ModemUnavailable(f"the channel at {self._url} has gone; start all again")
+            for message in self._line.receive():
+                if isinstance(message, End):
+                    return
+                if isinstance(message, Refused):
+                    raise ConfigError(message.reason)
+                if isinstance(message, Advance):
+                    self._now_s = message.now_s
+                    missed = self._modem.collect(message.arrivals, self._now_s)
+                    yield self._now_s
+                    frames = self._modem.frames_written()
+                    self._line.send(Done(now_s=self._now_s, frames=frames, missed=missed))
+
+    def end(self) -> None:
+        """Tell the channel that this vehicle's files are written."""
+        self._line.send(End())
+        self._line.close()
+
+
+def _connect(url: str) -> ControlLine:
+    if not url.startswith(CLOCK_SCHEME):
+        raise ConfigError(f"--clock is {url!r}; give wall, or the unix:// name that channel prints")
+    path = Path(url.removeprefix(CLOCK_SCHEME))
+    connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        connection.connect(str(path))
+    except OSError as error:
+        connection.close()
+        raise ModemUnavailable(
+            f"no channel at {url} ({error.strerror}); start fathomlink channel first"
+        ) from error
+    return ControlLine(connection)

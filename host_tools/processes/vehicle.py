@@ -1,0 +1,233 @@
+"""`fathomlink follower` and `fathomlink leader`: one vehicle, its loop on its modem's port."""
+
+import argparse
+import datetime
+import itertools
+import math
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from firmware.clock import Clock, WallClock
+from firmware.dead_reckoning import DeadReckoning, ReckonedState
+from firmware.follower.core import FollowerCore
+from firmware.follower.loop import FollowerLoop
+from firmware.leader.core import LEADER, LeaderCore
+from firmware.leader.loop import LeaderLoop
+from firmware.leader.worker import InlineWorker, ThreadWorker, Worker
+from firmware.ports import SensorStep
+from host_tools.collect import leader_record
+from host_tools.commands import Command
+from host_tools.mapping import DepthMap
+from host_tools.mission import deployed
+from host_tools.processes.records import VehicleFiles
+from host_tools.processes.served_clock import ServedClock, StampedModem
+from host_tools.processes.voyage import Voyage, add_voyage_arguments, voyage_of
+from host_tools.simulator.vehicle import SimulatedVehicle
+from protocol.errors import ConfigError
+from protocol.modems.base import Modem
+from protocol.modems.registry import open_modem
+from protocol.schedule import Slots
+
+BOOT_EPOCHS = 16
+STATUS_S = 60.0
+WALL = "wall"
+
+
+@dataclass(slots=True)
+class Aboard:
+    """A vehicle's loop with what it was started from."""
+
+    loop: FollowerLoop | LeaderLoop
+    worker: Worker
+    voyage: Voyage
+    truth_map: DepthMap
+    files: VehicleFiles | None
+
+
+def run_vehicle(
+    vehicle: int, modem_url: str, clock_url: str, voyage: Voyage, out: Path | None, start: str
+) -> None:
+    """Run one vehicle from its clock's first tick to its last, and write its files."""
+    files = None if out is None else VehicleFiles(out, vehicle)
+    starts = 0 if files is None else files.prepare()
+    modem, clock = _modem_and_clock(vehicle, modem_url, clock_url, voyage, start)
+    try:
+        ticks = clock.ticks(voyage.tick_s)
+        first_s = next(ticks, None)
+        if first_s is None:
+            return
+        in_real_time = isinstance(clock, WallClock)
+        aboard = _board(vehicle, starts, modem, clock, voyage, files, first_s)
+        _sail(aboard, itertools.chain([first_s], ticks), in_real_time=in_real_time)
+        aboard.worker.close()
+        _write(aboard, voyage)
+        if isinstance(clock, ServedClock):
+            clock.end()
+    finally:
+        modem.close()
+
+
+def _sail(aboard: Aboard, ticks: Iterator[float], *, in_real_time: bool) -> None:
+    """Step the loop; Ctrl-C in real time ends the mission as its last tick does."""
+    try:
+        for now_s in ticks:
+            aboard.loop.step(now_s)
+            if now_s != math.floor(now_s):
+                continue
+            core = aboard.loop.core
+            if aboard.files is not None:
+                aboard.files.note(core.belief(), core.reckoned)
+            if in_real_time and now_s % STATUS_S == 0.0:
+                print(_status_line(now_s, aboard.loop.status()), file=sys.stderr)
+    except KeyboardInterrupt:
+        if not in_real_time:
+            raise
+
+
+def _board(
+    vehicle: int,
+    starts: int,
+    modem: Modem,
+    clock: Clock,
+    voyage: Voyage,
+    files: VehicleFiles | None,
+    first_s: float,
+) -> Aboard:
+    """Return the vehicle with core, loop and sensors as of its first tick."""
+    settings, truth_map = voyage.settings, DepthMap(voyage.site.window)
+    simulated = SimulatedVehicle(
+        settings.scenario, voyage.site.seabed, vehicle, voyage.seed, truth_map.add
+    )
+    steps: Iterator[SensorStep] = simulated.steps()
+    start, steps = _navigated(deployed(simulated), steps, first_s)
+    slots, epoch = Slots(settings.slots), starts % BOOT_EPOCHS
+    worker: Worker = ThreadWorker() if isinstance(clock, WallClock) else InlineWorker()
+    loop: FollowerLoop | LeaderLoop
+    if vehicle == LEADER:
+        leader = LeaderCore(epoch, start, settings=settings.leader, slots=slots)
+        loop = LeaderLoop(leader, modem, steps, worker, clock.now_s, voyage.tick_s)
+    else:
+        follower = FollowerCore(vehicle, epoch, start, settings=settings.follower, slots=slots)
+        loop = FollowerLoop(follower, modem, steps, clock.now_s, voyage.tick_s)
+    return Aboard(loop=loop, worker=worker, voyage=voyage, truth_map=truth_map, files=files)
+
+
+def _navigated(
+    start: ReckonedState, steps: Iterator[SensorStep], first_s: float
+) -> tuple[ReckonedState, Iterator[SensorStep]]:
+    """Return dead reckoning just before the first tick, and the steps from then on.
+
+    The inertial navigation is a unit of its own: it goes on while the computer restarts.
+    """
+    reckoning = DeadReckoning(start)
+    for step in steps:
+        if step[0].time_s >= first_s - 1e-6:
+            return reckoning.state, itertools.chain([step], steps)
+        reckoning.receive_odometry(step[0])
+    return reckoning.state, steps
+
+
+def _modem_and_clock(
+    vehicle: int, modem_url: str, clock_url: str, voyage: Voyage, start: str
+) -> tuple[Modem, Clock]:
+    if clock_url == WALL:
+        modem = open_modem(modem_url)
+        start_utc_s = start_time_s(start)
+        began = datetime.datetime.fromtimestamp(start_utc_s, datetime.UTC)
+        print(f"the mission starts at {began:%Y-%m-%d %H:%M:%S} UTC", file=sys.stderr)
+        return modem, WallClock(start_utc_s, voyage.settings.scenario.duration_s)
+    stamped = StampedModem(open_modem(modem_url))
+    return stamped, ServedClock(clock_url, vehicle, voyage.fingerprint, stamped)
+
+
+def start_time_s(text: str) -> float:
+    """Return UTC seconds of a time such as 2026-05-01T12:00:00Z, or of the next whole minute.
+
+    Raises
+    ------
+    ConfigError
+        For a text that is no time, or one that is no whole second.
+    """
+    if text == "next":
+        return 60.0 * math.ceil(time.clock_gettime(time.CLOCK_REALTIME) / 60.0)
+    try:
+        moment = datetime.datetime.fromisoformat(text)
+    except ValueError as error:
+        raise ConfigError(f"--start is {text!r}; give UTC, such as 2026-05-01T12:00:00Z") from error
+    if moment.microsecond:
+        raise ConfigError(f"--start is {text!r}; transmissions need a whole second")
+    return (moment if moment.tzinfo else moment.replace(tzinfo=datetime.UTC)).timestamp()
+
+
+def _write(aboard: Aboard, voyage: Voyage) -> None:
+    if aboard.files is None:
+        print(_status_line(voyage.settings.scenario.duration_s, aboard.loop.status()))
+        return
+    aboard.files.write_counters(aboard.loop.status())
+    aboard.files.write_soundings(aboard.truth_map)
+    core = aboard.loop.core
+    if isinstance(core, LeaderCore):
+        seconds = math.floor(voyage.settings.scenario.duration_s) + 1
+        time_s = np.arange(0.0, seconds)
+        aboard.files.write_record(leader_record(core, time_s, voyage.site.window))
+
+
+def _status_line(now_s: float, counters: dict[str, int]) -> str:
+    shown = ", ".join(f"{name} {count}" for name, count in sorted(counters.items()) if count)
+    return f"{now_s:.0f} s: {shown}"
+
+
+def _configure(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--modem", required=True, metavar="URL", help="such as serial:///dev/ttyUSB0?baud=19200"
+    )
+    parser.add_argument(
+        "--clock",
+        default=WALL,
+        metavar="wall|unix://PATH",
+        help="wall: this computer's UTC (default); or the name that `fathomlink channel` prints",
+    )
+    parser.add_argument(
+        "--start", default="next", metavar="UTC", help="with the wall clock; default: next minute"
+    )
+    parser.add_argument("--out", type=Path, metavar="DIR", help="where the vehicle's files go")
+    add_voyage_arguments(parser)
+
+
+def _configure_follower(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--vehicle", type=int, default=1, metavar="N", help="number (default: 1)")
+    _configure(parser)
+
+
+def _run_follower(arguments: argparse.Namespace) -> None:
+    voyage = voyage_of(arguments)
+    followers = voyage.settings.scenario.followers
+    if not 1 <= arguments.vehicle <= followers:
+        raise ConfigError(
+            f"--vehicle is {arguments.vehicle}; this scenario's followers are 1 to {followers}"
+        )
+    _run(arguments.vehicle, arguments, voyage)
+
+
+def _run_leader(arguments: argparse.Namespace) -> None:
+    _run(LEADER, arguments, voyage_of(arguments))
+
+
+def _run(vehicle: int, arguments: argparse.Namespace, voyage: Voyage) -> None:
+    run_vehicle(vehicle, arguments.modem, arguments.clock, voyage, arguments.out, arguments.start)
+
+
+FOLLOWER = Command(
+    name="follower",
+    help="run a follower on a modem",
+    configure=_configure_follower,
+    run=_run_follower,
+)
+LEADER_COMMAND = Command(
+    name="leader", help="run the leader on a modem", configure=_configure, run=_run_leader
+)

@@ -83,6 +83,6 @@ def soundings_from_ping(
             ranges_m * np.cos(angles_rad) + settings.lever_down_m,
         ]
     )
-    R_ned_body = rotation_ned_body(ping.roll_rad, ping.pitch_rad, ping.yaw_rad)
-    soundings_ned_m = body_m @ R_ned_body.T + np.array([north_m, east_m, ping.depth_m])
+    rotation = rotation_ned_body(ping.roll_rad, ping.pitch_rad, ping.yaw_rad)
+    soundings_ned_m = body_m @ rotation.T + np.array([north_m, east_m, ping.depth_m])
     return soundings_ned_m, int(good.size - np.count_nonzero(good))

@@ -22,7 +22,7 @@ class CorrectionSettings(Settings):
     start_sigma_m: float = setting(0.5, "m", "uncertainty of the start", minimum=1e-3)
     odometry_noise: float = setting(0.2, "m/sqrt(s)", "random part of dead reckoning", minimum=1e-4)
     bias_sigma_mps: float = setting(0.15, "m/s", "unmeasured current at the start", minimum=1e-4)
-    bias_walk: float = setting(0.0008, "m/s/sqrt(s)", "how the current wanders", minimum=1e-7)
+    bias_walk: float = setting(0.002, "m/s/sqrt(s)", "how the current wanders", minimum=1e-7)
     answer_sigma_m: float = setting(3.0, "m", "error of an answer that tells none", minimum=0.01)
 
 

@@ -13,6 +13,7 @@ from firmware.leader.ledger import Anchor
 from firmware.leader.matching import MatchingSettings, MatchOutcome, match
 from firmware.leader.pose_graph import PoseGraph
 from firmware.submaps import GriddedSubmap
+from protocol.errors import EstimationError
 from protocol.settings import Settings, setting
 
 

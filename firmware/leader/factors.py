@@ -42,7 +42,7 @@ def factor_of(record: Record, robust_kernel: float) -> gtsam.NonlinearFactor:
 
 def _robust(covariance: Array, robust_kernel: float) -> gtsam.noiseModel.Base:
     return gtsam.noiseModel.Robust.Create(
-        gtsam.noiseModel.mEstimator.DCS.Create(robust_kernel),
+        gtsam.noiseModel.mEstimator.Huber.Create(robust_kernel),
         gtsam.noiseModel.Gaussian.Covariance(covariance),
     )
 

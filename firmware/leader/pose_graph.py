@@ -35,6 +35,9 @@ from protocol.errors import EstimationError
 from protocol.settings import Settings, setting
 
 
+_SETTLING_STEPS = 4  # a robust weight follows its residual one step late
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GraphSettings(Settings):
     """What the graph believes of dead reckoning, closures and ranges."""
@@ -55,7 +58,7 @@ class GraphSettings(Settings):
         0.1, "m/s", "vehicles drift in the same water: their biases differ by less", minimum=1e-4
     )
     bias_walk: float = setting(
-        0.0008, "m/s/sqrt(s)", "lets a current of 0.2 m/s turn within hours", minimum=1e-7
+        0.002, "m/s/sqrt(s)", "lets a current of 0.2 m/s turn within an hour", minimum=1e-7
     )
     heading_bias_sigma_deg: float = setting(
         0.5, "degree", "mounting error of the attitude reference", minimum=1e-6
@@ -68,7 +71,7 @@ class GraphSettings(Settings):
         0.4, "m", "strain within a sub-map that no match can see", minimum=0.0
     )
     robust_kernel: float = setting(
-        5.0, "sigma^2", "Phi of dynamic covariance scaling on closures and ranges", minimum=0.1
+        3.0, "sigma", "Huber's kernel: convex, so that a large true innovation cannot stick", minimum=0.1
     )
 
 
@@ -215,6 +218,9 @@ class PoseGraph:
             result = self._isam.update(added, self._fresh, removed)
             for number, slot in zip(numbers, result.getNewFactorsIndices(), strict=True):
                 self._ledger[number].slot = slot
+            for _ in range(_SETTLING_STEPS if numbers or removed else 0):
+                if self._isam.update().getVariablesRelinearized() == 0:
+                    break
             self._values = self._isam.calculateEstimate()
         except RuntimeError:
             self._values.insert(self._fresh)
@@ -376,6 +382,7 @@ class PoseGraph:
 
 def _new_isam() -> gtsam.ISAM2:
     parameters = gtsam.ISAM2Params()
+    parameters.setOptimizationParams(gtsam.ISAM2DoglegParams())  # ranges may be far from linear
     parameters.setFactorization("QR")  # Cholesky calls a long dead-reckoned chain indeterminate
     parameters.setRelinearizeThreshold(0.02)
     parameters.relinearizeSkip = 1

@@ -1,0 +1,106 @@
+"""From pings and odometry to states, soundings and sub-maps."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from firmware.compression.settings import BinningSettings
+from firmware.dead_reckoning import DeadReckoning, ReckonedState
+from firmware.soundings import Odometry, Ping, SonarSettings, soundings_from_ping
+from firmware.submap_builder import SubmapBuilder, SubmapSettings
+
+START = ReckonedState(time_s=0.0, north_m=5.0, east_m=-3.0, yaw_rad=0.0, depth_m=10.0)
+
+
+def ping(**changes: object) -> Ping:
+    angles_rad = np.radians([-60.0, 0.0, 60.0])
+    level = Ping(
+        time_s=0.0,
+        slant_ranges_m=40.0 / np.cos(angles_rad),
+        beam_angles_rad=angles_rad,
+        roll_rad=0.0,
+        pitch_rad=0.0,
+        yaw_rad=0.0,
+        depth_m=10.0,
+    )
+    return dataclasses.replace(level, **changes)  # type: ignore[arg-type]
+
+
+def odometry(time_s: float, north_mps: float = 2.0) -> Odometry:
+    return Odometry(
+        time_s=time_s,
+        velocity_north_mps=north_mps,
+        velocity_east_mps=0.0,
+        yaw_rad=0.0,
+        depth_m=10.0,
+    )
+
+
+def test_level_ping_heading_north_spreads_east_and_west_at_seabed_depth() -> None:
+    soundings_m, bad = soundings_from_ping(ping(), 100.0, 200.0, SonarSettings())
+    reach_m = 40.0 * np.tan(np.radians(60.0))
+    expected_m = [[100, 200 - reach_m, 50], [100, 200, 50], [100, 200 + reach_m, 50]]
+    assert soundings_m == pytest.approx(np.array(expected_m))
+    assert bad == 0
+
+
+def test_roll_to_starboard_turns_the_port_beams_up_and_lever_arm_follows_heading() -> None:
+    rolled, _ = soundings_from_ping(ping(roll_rad=0.1), 0.0, 0.0, SonarSettings())
+    assert rolled[0, 2] > 50.0 or rolled[2, 2] > 50.0
+    assert rolled[1, 1] == pytest.approx(-40.0 * np.sin(0.1))
+    levered = SonarSettings(lever_forward_m=2.0)
+    east, _ = soundings_from_ping(ping(yaw_rad=np.pi / 2), 0.0, 0.0, levered)
+    assert east[1, :2] == pytest.approx([0.0, 2.0], abs=1e-9)
+
+
+@pytest.mark.parametrize("bad_m", [np.nan, np.inf, -5.0, 0.0, 1e9])
+def test_beam_that_no_echo_can_make_is_left_out_and_counted(bad_m: float) -> None:
+    soundings_m, bad = soundings_from_ping(
+        ping(slant_ranges_m=np.array([60.0, bad_m, 60.0])), 0.0, 0.0, SonarSettings()
+    )
+    assert len(soundings_m) == 2
+    assert bad == 1
+
+
+def test_ping_without_attitude_gives_no_soundings() -> None:
+    soundings_m, bad = soundings_from_ping(ping(roll_rad=np.nan), 0.0, 0.0, SonarSettings())
+    assert soundings_m.shape == (0, 3)
+    assert bad == 3
+
+
+def test_dead_reckoning_keeps_the_last_velocity_through_bad_samples() -> None:
+    reckoning = DeadReckoning(START)
+    for time_s, speed_mps in ((1.0, 2.0), (2.0, np.nan), (3.0, 2.0)):
+        reckoning.receive_odometry(odometry(time_s, speed_mps))
+    assert reckoning.state.north_m == pytest.approx(START.north_m + 6.0)
+    assert reckoning.bad_samples == 1
+
+
+@pytest.mark.parametrize("time_s", [-1.0, np.nan, np.inf])
+def test_dead_reckoning_drops_samples_from_no_possible_time(time_s: float) -> None:
+    reckoning = DeadReckoning(START)
+    assert reckoning.receive_odometry(odometry(time_s)) == START
+    assert reckoning.bad_samples == 1
+
+
+def test_builder_closes_a_submap_at_the_end_of_its_window_and_numbers_wrap() -> None:
+    builder = SubmapBuilder(
+        1,
+        3,
+        settings=SubmapSettings(duration_s=8.0),
+        sonar=SonarSettings(),
+        binning=BinningSettings(),
+        first_index=65535,
+    )
+    reckoning, submaps = DeadReckoning(START), []
+    for time_s in np.arange(0.0, 24.25, 0.25):
+        state = reckoning.receive_odometry(odometry(float(time_s)))
+        builder.receive_state(state)
+        submap = builder.take()
+        submaps += [submap] if submap else []
+        builder.receive_ping(ping(time_s=float(time_s)), state)
+    assert [(s.index, s.boot_epoch) for s in submaps] == [(65535, 3), (0, 3), (1, 3)]
+    assert submaps[1].track.time_s.tolist() == list(np.arange(8.0, 16.0))
+    assert (submaps[1].bins.time_s >= 8.0).all()
+    assert (submaps[1].bins.time_s < 16.0).all()

@@ -1,0 +1,67 @@
+"""What answers teach a follower, and what they must not."""
+
+import numpy as np
+import pytest
+
+from firmware.follower.correction import CorrectionSettings, DriftCorrection
+
+BIAS_MPS = np.array([0.1, -0.07])
+
+
+def drift_m(time_s: float) -> np.ndarray:
+    return BIAS_MPS * time_s
+
+
+def taught(until_s: float = 600.0) -> DriftCorrection:
+    correction = DriftCorrection(0.0, CorrectionSettings())
+    for time_s in np.arange(80.0, until_s + 1, 40.0):
+        correction.receive_answer(float(time_s), drift_m(time_s), np.zeros(2))
+    return correction
+
+
+def test_old_answers_correct_the_present_by_the_drift_they_taught() -> None:
+    position_m, covariance_m2 = taught().corrected(720.0, drift_m(720.0))
+    assert position_m == pytest.approx([0.0, 0.0], abs=2.0)
+    assert 1.0 < np.sqrt(covariance_m2[0, 0]) < 10.0
+
+
+def test_single_wrong_answer_cannot_throw_the_follower_off() -> None:
+    correction = taught()
+    assert not correction.receive_answer(640.0, drift_m(640.0), np.array([300.0, 0.0]))
+    position_m, _ = correction.corrected(660.0, drift_m(660.0))
+    assert position_m == pytest.approx([0.0, 0.0], abs=2.0)
+    assert correction.gated == 1
+
+
+def test_leader_that_changes_its_mind_twice_alike_is_believed() -> None:
+    correction = DriftCorrection(0.0, CorrectionSettings())
+    for time_s in (80.0, 120.0, 160.0, 200.0):
+        correction.receive_answer(time_s, drift_m(time_s), np.array([-25.0, 20.0]) * time_s / 200)
+    for time_s in (240.0, 280.0, 320.0):
+        correction.receive_answer(time_s, drift_m(time_s), np.zeros(2))
+    position_m, _ = correction.corrected(400.0, drift_m(400.0))
+    assert position_m == pytest.approx([0.0, 0.0], abs=4.0)
+
+
+def test_repeated_answer_is_not_counted_as_new_evidence() -> None:
+    once, often = taught(), taught()
+    for correction, times in ((once, 1), (often, 20)):
+        for _ in range(times):
+            correction.receive_answer(640.0, drift_m(640.0), np.array([2.0, 2.0]))
+    for a, b in zip(once.corrected(700.0, np.zeros(2)), often.corrected(700.0, np.zeros(2))):
+        assert a == pytest.approx(b)
+
+
+def test_stale_answer_changes_nothing() -> None:
+    correction = taught()
+    before_m = correction.corrected(700.0, np.zeros(2))[0]
+    assert not correction.receive_answer(100.0, drift_m(100.0), np.zeros(2))
+    assert correction.corrected(700.0, np.zeros(2))[0] == pytest.approx(before_m)
+    assert correction.stale == 1
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_answer_that_is_no_position_is_dropped(bad: float) -> None:
+    correction = taught()
+    assert not correction.receive_answer(640.0, np.zeros(2), np.array([bad, 0.0]))
+    assert np.isfinite(correction.corrected(700.0, np.zeros(2))[0]).all()

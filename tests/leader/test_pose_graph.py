@@ -1,0 +1,141 @@
+"""The incremental pose graph against a dense solution of the same records."""
+
+import numpy as np
+import pytest
+
+from firmware.leader.ledger import OdometryRecord, PriorRecord, RangeRecord, SharedDriftRecord
+from firmware.leader.pose_graph import GraphSettings, PoseGraph
+from firmware.submaps import Track
+from protocol.errors import EstimationError
+
+SETTINGS = GraphSettings()
+
+
+def walk(rng: np.random.Generator, seconds: int, heading_rad: float) -> tuple[Track, np.ndarray]:
+    """Return a dead-reckoned track that drifts, and the true positions (T, 2)."""
+    time_s = np.arange(seconds + 1.0)
+    leg = np.where((time_s // 200) % 2 == 0, heading_rad, heading_rad + np.pi)
+    steps_m = 2.0 * np.column_stack([np.cos(leg), np.sin(leg)])
+    true_m = np.cumsum(steps_m, axis=0) - steps_m[0]
+    noise_m = np.array([0.1, 0.05]) + 0.2 * rng.standard_normal(steps_m.shape)
+    drift_m = np.cumsum(noise_m, axis=0) - noise_m[0]
+    north_m, east_m = (true_m + drift_m).T
+    return Track(time_s=time_s, north_m=north_m, east_m=east_m, yaw_rad=leg), true_m
+
+
+def started(track: Track, vehicle: int = 0, graph: PoseGraph | None = None) -> PoseGraph:
+    graph = graph or PoseGraph(SETTINGS)
+    start_m = np.array([track.north_m[0], track.east_m[0]])
+    graph.add_vehicle(vehicle, 0.0, start_m, start_m)
+    graph.extend(vehicle, track)
+    return graph
+
+
+def close(
+    graph: PoseGraph, track: Track, true_m: np.ndarray, a_s: int, b_s: int, error_m: float = 0.0
+) -> int:
+    ends = [graph.anchor(0, float(t), track) for t in (a_s, b_s)]
+    offset_m = true_m[b_s] - true_m[a_s] + error_m
+    return graph.add_closure(ends[0], ends[1], offset_m, np.eye(2), active=True)
+
+
+def test_closures_recover_the_drift_that_dead_reckoning_hides() -> None:
+    track, true_m = walk(np.random.default_rng(1), 800, 0.3)
+    graph = started(track)
+    for a_s, b_s in ((20, 380), (100, 500), (150, 650), (30, 770)):
+        close(graph, track, true_m, a_s, b_s)
+    graph.update()
+    estimate = graph.trajectory(0)
+    reckoned_m = np.column_stack([track.north_m, track.east_m])
+    error_m = np.hypot(*(estimate.correct(track.time_s, reckoned_m) - true_m).T)
+    assert error_m.mean() < 0.1 * np.hypot(*(reckoned_m - true_m).T).mean()
+    assert estimate.bias_mps[-1] == pytest.approx([0.1, 0.05], abs=0.03)
+
+
+def test_incremental_and_batch_solutions_agree_to_five_centimetres() -> None:
+    rng = np.random.default_rng(2)
+    track, true_m = walk(rng, 1200, 0.0)
+    other, other_true_m = walk(rng, 1200, 1.5)
+    graph = started(other, 1, started(track))
+    for second in range(60, 1200, 40):
+        ends = graph.anchor(0, float(second), track), graph.anchor(1, float(second), other)
+        range_m = float(np.hypot(*(true_m[second] - other_true_m[second])))
+        graph.add_range(*ends, range_m + rng.standard_normal())
+        if second > 400:
+            close(graph, track, true_m, second - 390, second)
+            there = graph.anchor(0, second - 40.0, track)
+            offset_m = other_true_m[second] - true_m[second - 40]
+            graph.add_closure(there, ends[1], offset_m, np.eye(2), active=True)
+        graph.update()
+    before_m = np.vstack([graph.trajectory(v).position_m for v in (0, 1)])
+    graph.solve_batch()
+    after_m = np.vstack([graph.trajectory(v).position_m for v in (0, 1)])
+    assert np.abs(before_m - after_m).max() < 0.05
+
+
+def test_covariance_is_that_of_the_dense_information_matrix() -> None:
+    track, true_m = walk(np.random.default_rng(3), 100, 0.0)
+    graph = started(track)
+    close(graph, track, true_m, 10, 90)
+    graph.update()
+    anchors = [graph.anchor(0, t, track) for t in (0.0, 50.0, 100.0)]
+    linear = graph._isam.getFactorsUnsafe().linearize(graph._values)
+    ordering = sorted(graph._values.keys())
+    jacobian, _ = linear.jacobian()
+    dense_m2 = np.linalg.inv(jacobian.T @ jacobian)
+    first = {key: 2 + 4 * k for k, key in enumerate(k for k in ordering if chr(k >> 56) == "x")}
+    rows = [first[a.key] + axis for a in anchors for axis in (0, 1)]
+    assert graph.covariance(anchors) == pytest.approx(dense_m2[np.ix_(rows, rows)], rel=1e-6)
+
+
+def test_deactivated_closure_leaves_no_trace() -> None:
+    track, true_m = walk(np.random.default_rng(4), 600, 0.0)
+    graph, untouched = started(track), started(track)
+    for g in (graph, untouched):
+        close(g, track, true_m, 20, 380)
+        g.update()
+    wrong = close(graph, track, true_m, 50, 550, error_m=3.0)
+    graph.update()
+    graph.set_active(wrong, active=False)
+    graph.update()
+    difference_m = graph.trajectory(0).position_m - untouched.trajectory(0).position_m
+    assert np.abs(difference_m).max() < 1e-3
+
+
+def test_long_chain_without_closures_stays_solvable() -> None:
+    time_s = np.arange(0.0, 20_000.0, 10.0)
+    track = Track(time_s=time_s, north_m=2 * time_s, east_m=0 * time_s, yaw_rad=0 * time_s)
+    graph = started(track)
+    graph.update()
+    assert graph.rebuilds == 0
+    assert graph.trajectory(0).position_m[-1] == pytest.approx([2 * time_s[-1], 0.0], abs=1e-3)
+
+
+def test_gap_in_a_track_is_bridged_by_composed_positions() -> None:
+    track, _ = walk(np.random.default_rng(5), 300, 0.0)
+    kept = (track.time_s < 100) | (track.time_s > 180)
+    gappy = Track(**{n: getattr(track, n)[kept] for n in ("time_s", "north_m", "east_m", "yaw_rad")})
+    graph = started(gappy)
+    graph.update()
+    estimate = graph.trajectory(0)
+    assert not np.any((estimate.time_s > 110) & (estimate.time_s < 170))
+    assert estimate.position_m[-1] == pytest.approx([track.north_m[-1], track.east_m[-1]], abs=1e-3)
+
+
+def test_time_without_a_node_is_an_error_that_names_the_nearest() -> None:
+    track, _ = walk(np.random.default_rng(6), 100, 0.0)
+    with pytest.raises(EstimationError, match=r"no node near 500\.0 s; the nearest is at 100\.0 s"):
+        started(track).anchor(0, 500.0, track)
+    with pytest.raises(EstimationError, match="vehicle 7 has no chain"):
+        started(track).anchor(7, 10.0, track)
+
+
+def test_ledger_holds_every_record_that_the_graph_was_told() -> None:
+    track, _ = walk(np.random.default_rng(7), 50, 0.0)
+    graph = started(track, 1, started(track))
+    number = graph.add_range(graph.anchor(0, 50.0, track), graph.anchor(1, 50.0, track), 5.0)
+    assert isinstance(graph.record(number), RangeRecord)
+    kinds = [type(graph.record(k)) for k in range(number)]
+    assert kinds.count(PriorRecord) == 4
+    assert kinds.count(SharedDriftRecord) == 1
+    assert kinds.count(OdometryRecord) == 10

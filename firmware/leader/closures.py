@@ -13,7 +13,6 @@ from firmware.leader.ledger import Anchor
 from firmware.leader.matching import MatchingSettings, MatchOutcome, match
 from firmware.leader.pose_graph import PoseGraph
 from firmware.submaps import GriddedSubmap
-from protocol.errors import EstimationError
 from protocol.settings import Settings, setting
 
 
@@ -58,7 +57,11 @@ class Closure:
     offset_m: Array
     covariance_m2: Array
     residual: float
+    misfit: float  # residual over what the noise model predicts
     axis_deg: float | None
+    origin_reckoned_m: Array  # (2,) raw dead reckoning at the anchors' times
+    target_reckoned_m: Array
+    predicted_sigma_m: float = np.inf  # of the offset, before this closure was known
     stage: Stage = Stage.DETECTED
     number: int | None = None  # in the ledger, once gated
     active: bool = False
@@ -147,7 +150,10 @@ def closure_of(
         offset_m=ends_m[1] + found.shift_m - ends_m[0],
         covariance_m2=found.covariance_m2,
         residual=found.residual,
+        misfit=found.residual / found.variance_m2,
         axis_deg=found.axis_deg,
+        origin_reckoned_m=job.origin.reckoned_at(found.reference_time_s),
+        target_reckoned_m=job.target.reckoned_at(found.query_time_s),
     )
 
 
@@ -161,6 +167,8 @@ def gate(closure: Closure, graph: PoseGraph, settings: ClosureSettings) -> bool:
     if innovation_m @ np.linalg.solve(spread_m2, innovation_m) > settings.gate_chi_square:
         return False
     closure.stage = Stage.GATED
+    prior_m2 = spread_m2 - closure.covariance_m2
+    closure.predicted_sigma_m = float(np.sqrt(max(np.linalg.eigvalsh(prior_m2)[-1], 0.0)))
     closure.number = graph.add_closure(
         closure.origin_anchor,
         closure.target_anchor,
@@ -169,14 +177,6 @@ def gate(closure: Closure, graph: PoseGraph, settings: ClosureSettings) -> bool:
         active=False,
     )
     return True
-
-
-def activate(closure: Closure, graph: PoseGraph) -> None:
-    """Take a gated closure into the estimate from the next update on."""
-    if closure.number is None:
-        raise EstimationError("a closure has to be gated before it can be active")
-    closure.active = True
-    graph.set_active(closure.number, active=True)
 
 
 def count_stages(closures: Iterable[Closure]) -> dict[str, int]:

@@ -14,7 +14,8 @@ import numpy as np
 from firmware.belief import Belief
 from firmware.dead_reckoning import DeadReckoning, ReckonedState
 from firmware.leader.atlas import Atlas, Sheet, SheetId, sheet_of
-from firmware.leader.closures import Closure, MatchJob, activate, closure_of, gate, jobs_for
+from firmware.leader.closures import Closure, MatchJob, closure_of, gate, jobs_for
+from firmware.leader.judgement import Judgement
 from firmware.leader.matching import MatchOutcome
 from firmware.leader.own_grid import grid_of
 from firmware.leader.pose_graph import PoseGraph
@@ -88,6 +89,8 @@ class LeaderCore:
         self._stretches: deque[Submap] = deque(maxlen=hops)
         self._reassembler = Reassembler(settings.reassembly)
         self._ranging = Ranging(settings.ranges)
+        self._judgement = Judgement(settings.judgement, settings.matching)
+        self._sheets_judged = 0
         self._tracks: dict[int, TrackBuffer] = {LEADER: TrackBuffer()}
         self._sheets_to_match: deque[Sheet] = deque(maxlen=16)
         self._answers: dict[int, _LatestAnswer] = {}
@@ -161,6 +164,7 @@ class LeaderCore:
 
     def finish(self, done: SheetJobs, outcomes: list[MatchOutcome], now_s: float) -> None:
         """Judge what the matches of one sheet found, and bring the estimate up to it."""
+        gated = []
         for job, outcome in zip(done.jobs, outcomes, strict=True):
             if outcome.reason is not None:
                 self.counters[f"match_{outcome.reason.name.lower()}"] += 1
@@ -170,10 +174,15 @@ class LeaderCore:
                     continue
                 self.closures.append(closure)
                 if gate(closure, self.graph, self._settings.closures):
-                    activate(closure, self.graph)
+                    gated.append(closure)
             except EstimationError:
                 self.counters["closures_unplaceable"] += 1
+        self._judgement.consider(gated, self.atlas, self.graph)
         self.graph.update()
+        self._sheets_judged += 1
+        if self._sheets_judged % self._settings.sheets_between_audits == 0:
+            self._judgement.audit(self.closures, self.graph)
+            self.graph.update()
 
     # what goes out
 
@@ -225,6 +234,7 @@ class LeaderCore:
         return {
             **self.counters,
             **self._ranging.counters,
+            **self._judgement.counters,
             **{f"reassembly_{k}": v for k, v in _counters_of(self._reassembler).items()},
             "bad_odometry": self._reckoning.bad_samples,
             "bad_beams": self._builder.bad_beams,

@@ -34,7 +34,6 @@ from firmware.submaps import Track
 from protocol.errors import EstimationError
 from protocol.settings import Settings, setting
 
-
 _SETTLING_STEPS = 4  # a robust weight follows its residual one step late
 
 
@@ -71,7 +70,7 @@ class GraphSettings(Settings):
         0.4, "m", "strain within a sub-map that no match can see", minimum=0.0
     )
     robust_kernel: float = setting(
-        3.0, "sigma", "Huber's kernel: convex, so that a large true innovation cannot stick", minimum=0.1
+        3.0, "sigma", "Huber: convex, so that large true innovations cannot stick", minimum=0.1
     )
 
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from firmware.compression.settings import BinningSettings
 from firmware.leader.closures import ClosureSettings
+from firmware.leader.judgement import JudgementSettings
 from firmware.leader.matching import MatchingSettings
 from firmware.leader.pose_graph import GraphSettings
 from firmware.leader.ranges import RangeSettings
@@ -25,6 +26,10 @@ class LeaderSettings(Settings):
     reconstruction: ReconstructionSettings = setting(ReconstructionSettings, "", "frames to grids")
     matching: MatchingSettings = setting(MatchingSettings, "", "terrain matching")
     closures: ClosureSettings = setting(ClosureSettings, "", "loop closures")
+    judgement: JudgementSettings = setting(JudgementSettings, "", "which closures to believe")
+    sheets_between_audits: int = setting(
+        10, "sub-maps", "an audit of all closures every two minutes or so", minimum=1
+    )
     ranges: RangeSettings = setting(RangeSettings, "", "one-way travel times")
     graph: GraphSettings = setting(GraphSettings, "", "the pose graph")
     cell_m: float = setting(

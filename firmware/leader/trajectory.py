@@ -31,6 +31,10 @@ class Trajectory:
         ]
         return np.asarray(reckoned_m + np.stack(axes, axis=-1))
 
+    def bias_at(self, time_s: float) -> Array:
+        """Return the dead-reckoning bias (2,) in m/s at the time."""
+        return np.array([np.interp(time_s, self.time_s, self.bias_mps[:, a]) for a in (0, 1)])
+
     def drift_at(self, time_s: float, window_s: float = 40.0) -> Array:
         """Return the velocity (2,) in m/s by which dead reckoning ran away around the time.
 

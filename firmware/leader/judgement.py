@@ -1,0 +1,216 @@
+"""Which gated closures to believe: the graph, other closures and the map are asked in turn.
+
+A closure is consistent when the graph already knew its offset to a few metres (then its gate was
+proof enough), when another closure closes a loop with it (pairwise consistency), or when the map
+that it would build agrees where the match did not look. This is our reading of the paper's MCM,
+identification of invalid closures by the consistency of the built map; its text is not public.
+What is not yet believed waits, and is asked again when more is known. An audit takes back closures
+that the estimate has come to contradict, and takes them in again when it no longer does.
+"""
+
+from collections import Counter, deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from firmware.geometry import Array
+from firmware.leader.atlas import Atlas, Sheet
+from firmware.leader.closures import Closure, Stage
+from firmware.leader.consistency import (
+    CandidateClosure,
+    ConsistencySettings,
+    Keys,
+    consistent_set,
+)
+from firmware.leader.map_vote import VoteSettings, VoteWindow, carried, vote
+from firmware.leader.matching import MatchingSettings
+from firmware.leader.pose_graph import PoseGraph
+from protocol.settings import Settings, setting
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JudgementSettings(Settings):
+    """What it takes to believe a closure."""
+
+    known_sigma_m: float = setting(
+        5.0, "m", "an offset known so well leaves a false match no room", minimum=0.1
+    )
+    waiting: int = setting(
+        48, "closures", "gated but not believed; the oldest is given up", minimum=2, maximum=200
+    )
+    vote_windows: int = setting(
+        4, "pairs", "of neighbouring sub-maps asked; each costs as much as a match", minimum=1
+    )
+    vote_ratio: float = setting(3.0, "log ratio", "twenty to one that the map agrees", minimum=0.0)
+    odometry_noise: float = setting(
+        0.2, "m/sqrt(s)", "random part of dead reckoning between closures", minimum=1e-4
+    )
+    drift_sigma_mps: float = setting(
+        0.05, "m/s", "drift that remains once the estimated one is taken out", minimum=1e-4
+    )
+    reject_chi_square: float = setting(
+        16.0, "1", "four sigmas: active closures beyond it are taken back", minimum=1.0
+    )
+    accept_chi_square: float = setting(
+        6.0, "1", "95 %: a taken-back closure within it is taken in again", minimum=1.0
+    )
+    pairwise: ConsistencySettings = setting(ConsistencySettings, "", "pairwise consistency")
+    vote: VoteSettings = setting(VoteSettings, "", "map consistency")
+
+
+class Judgement:
+    """Decides on gated closures; keeps those that wait, bounded."""
+
+    def __init__(self, settings: JudgementSettings, matching: MatchingSettings) -> None:
+        self.counters: Counter[str] = Counter()
+        self._settings, self._matching = settings, matching
+        self._waiting: deque[Closure] = deque(maxlen=settings.waiting)
+
+    def consider(self, gated: list[Closure], atlas: Atlas, graph: PoseGraph) -> None:
+        """Believe what can be believed of the new closures and of those that wait."""
+        doubtful = []
+        for closure in gated:
+            if closure.predicted_sigma_m <= self._settings.known_sigma_m:
+                self._believe(closure, graph, "graph")
+            else:
+                doubtful.append(closure)
+        candidates = [*self._waiting, *doubtful]
+        if len(candidates) > 1:
+            found = consistent_set(
+                [_candidate(k, c) for k, c in enumerate(candidates)],
+                _Odometry(candidates, graph, self._settings),
+                self._settings.pairwise,
+            )
+            for k, closure in enumerate(candidates):
+                if found.believed[k] and found.partners[k] > 0:
+                    self._believe(closure, graph, "partners")
+        for closure in doubtful:
+            if not closure.active and self._map_agrees(closure, atlas, graph):
+                self._believe(closure, graph, "map")
+        waiting = [c for c in candidates if not c.active]
+        self.counters["closures_given_up"] += max(0, len(waiting) - self._settings.waiting)
+        self._waiting = deque(waiting, self._settings.waiting)
+
+    def audit(self, closures: list[Closure], graph: PoseGraph) -> None:
+        """Take back active closures that the estimate contradicts; take in those it confirms."""
+        for closure in closures:
+            if closure.number is None or closure.stage is not Stage.CONSISTENT:
+                continue
+            innovation_m = graph.innovation(closure.number)
+            chi_square = innovation_m @ np.linalg.solve(closure.covariance_m2, innovation_m)
+            if closure.active and chi_square > self._settings.reject_chi_square:
+                closure.active = False
+                self.counters["closures_taken_back"] += 1
+            elif not closure.active and chi_square < self._settings.accept_chi_square:
+                closure.active = True
+                self.counters["closures_taken_in_again"] += 1
+            graph.set_active(closure.number, active=closure.active)
+
+    def _believe(self, closure: Closure, graph: PoseGraph, reason: str) -> None:
+        if closure.number is None:
+            return
+        closure.stage, closure.active = Stage.CONSISTENT, True
+        graph.set_active(closure.number, active=True)
+        self.counters[f"closures_believed_by_{reason}"] += 1
+
+    def _map_agrees(self, closure: Closure, atlas: Atlas, graph: PoseGraph) -> bool:
+        """Ask neighbouring sub-maps, carried along by dead reckoning, whether they fit as well."""
+        origin, target = atlas[closure.origin], atlas[closure.target]
+        windows = [
+            self._window(closure, (origin, target), pair, graph)
+            for pair in _neighbour_pairs(origin, target, atlas)[: self._settings.vote_windows]
+        ]
+        if not windows:
+            return False
+        outcome = vote(windows, self._matching, self._settings.vote, closure.misfit)
+        return outcome.informed > 0 and outcome.log_ratio > self._settings.vote_ratio
+
+    def _window(
+        self,
+        closure: Closure,
+        matched: tuple[Sheet, Sheet],
+        neighbours: tuple[Sheet, Sheet],
+        graph: PoseGraph,
+    ) -> VoteWindow:
+        shift_m = closure.offset_m - (closure.target_reckoned_m - closure.origin_reckoned_m)
+        trajectories = [graph.trajectory(sheet.id.vehicle) for sheet in matched]
+        (reference, reference_drift), (query, query_drift) = (
+            sheet.without_drift(trajectory)
+            for sheet, trajectory in zip(neighbours, trajectories, strict=True)
+        )
+        ages_s = (
+            neighbours[0].time_s - closure.origin_anchor.time_s,
+            neighbours[1].time_s - closure.target_anchor.time_s,
+        )
+        shift_m, covariance_m2 = carried(
+            shift_m, closure.covariance_m2, ages_s, (reference_drift, query_drift), self._matching
+        )
+        return VoteWindow(
+            reference=reference,
+            query=query,
+            shift_m=shift_m,
+            covariance_m2=covariance_m2,
+            reference_reconstructed=neighbours[0].reconstructed,
+            query_reconstructed=neighbours[1].reconstructed,
+        )
+
+
+class _Odometry:
+    """Offsets between the ends of closures by dead reckoning alone; even keys are origins."""
+
+    def __init__(
+        self, closures: list[Closure], graph: PoseGraph, settings: JudgementSettings
+    ) -> None:
+        ends = [
+            end
+            for c in closures
+            for end in (
+                (c.origin.vehicle, c.origin_anchor.time_s, c.origin_reckoned_m),
+                (c.target.vehicle, c.target_anchor.time_s, c.target_reckoned_m),
+            )
+        ]
+        self._settings = settings
+        self._vehicle = np.array([vehicle for vehicle, _, _ in ends])
+        self._time_s = np.array([time_s for _, time_s, _ in ends])
+        self._position_m = np.array(
+            [
+                reckoned_m - graph.trajectory(vehicle).bias_at(time_s) * time_s
+                for vehicle, time_s, reckoned_m in ends
+            ]
+        )
+
+    def __call__(self, first: Keys, second: Keys) -> tuple[Array, Array]:
+        """Return offsets (P, 2) and covariances (P, 2, 2), NaN between vehicles."""
+        s = self._settings
+        apart_s = np.abs(self._time_s[second] - self._time_s[first])
+        offset_m = self._position_m[second] - self._position_m[first]
+        variance_m2 = s.odometry_noise**2 * apart_s + (s.drift_sigma_mps * apart_s) ** 2
+        other = self._vehicle[first] != self._vehicle[second]
+        offset_m[other], variance_m2[other] = np.nan, np.nan
+        return offset_m, variance_m2[:, None, None] * np.eye(2)
+
+
+def _candidate(position: int, closure: Closure) -> CandidateClosure:
+    return CandidateClosure(
+        origin=2 * position,
+        target=2 * position + 1,
+        offset_m=closure.offset_m,
+        covariance_m2=closure.covariance_m2,
+    )
+
+
+def _neighbour_pairs(origin: Sheet, target: Sheet, atlas: Atlas) -> list[tuple[Sheet, Sheet]]:
+    """Return pairs of sub-maps measured just before or after the matched ones, nearest first."""
+
+    def near(sheet: Sheet) -> list[Sheet]:
+        same = [o for o in atlas if o.id.vehicle == sheet.id.vehicle and o.id != sheet.id]
+        apart = [(abs(o.time_s - sheet.time_s), k) for k, o in enumerate(same)]
+        return [same[k] for gap_s, k in sorted(apart) if _NEXT_S[0] < gap_s < _NEXT_S[1]]
+
+    pairs = [(o, target) for o in near(origin)] + [(origin, t) for t in near(target)]
+    pairs += [(o, t) for o in near(origin) for t in near(target)]
+    return [pair for pair in pairs if pair[0].id != pair[1].id]
+
+
+_NEXT_S = (35.0, 90.0)
+"""Neighbours share no soundings with the matched sub-map, and dead reckoning still holds."""

@@ -1,6 +1,7 @@
 """Forty seconds of soundings in ten frames: binning, the fit, its packets."""
 
 from collections.abc import Iterator
+from typing import overload
 
 import numpy as np
 
@@ -48,6 +49,18 @@ def compress_steps(
     if profile == "dense":
         return _dense_steps(bins, settings)
     return compress_point_steps(bins, settings)
+
+
+@overload
+def compress(
+    bins: BinnedSoundings, settings: CompressionSettings | None = None
+) -> CompressedPoints: ...
+
+
+@overload
+def compress(
+    bins: BinnedSoundings, settings: CompressionSettings | None, profile: str
+) -> Compressed: ...
 
 
 def compress(

@@ -64,6 +64,10 @@ class Outline:
             equations = np.empty((0, 3))
         return cls(equations[:, :2], equations[:, 2])
 
+    def outside(self, position_m: Array) -> NDArray[np.bool_]:
+        """Return which positions (N, 2) lie outside."""
+        return np.asarray((position_m @ self.normal.T + self.offset_m > 1e-9).any(axis=1))
+
     def excess(self, point_m: Array) -> tuple[float, Array]:
         """Return the sum of squared distances outside, m^2, and its gradient (M, 2)."""
         beyond_m = np.maximum(point_m @ self.normal.T + self.offset_m, 0.0)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from firmware.compression.dense import DenseCode
 from firmware.compression.lattice import LatticeCode
 from firmware.compression.settings import CompressionSettings
+from protocol.errors import LocalProtocolError
 from protocol.packets import Profile
 
 PAPER_FRAGMENTS, PAPER_POINTS = 10, 15
@@ -49,6 +50,8 @@ class CompressedCode:
     report: FitReport
 
 
-def fragment_points(compressed: CompressedPoints) -> NDArray[np.float32]:
-    """Return the points as (F, M / F, 3), by fragment."""
+def fragment_points(compressed: CompressedPoints | CompressedCode) -> NDArray[np.float32]:
+    """Return the points as (F, M / F, 3), by fragment; only `paper` has them one by one."""
+    if not isinstance(compressed, CompressedPoints):
+        raise LocalProtocolError(f"{compressed.profile.name} has no points by fragment")
     return compressed.points_ned_m.reshape(compressed.fragment_count, -1, 3)

@@ -56,6 +56,8 @@ def host_mission(
         folder=ports,
         is_overdue=pace.is_over if pace is not None else lambda _: False,
     ) as fleet:
+        for node in fleet.nodes.values():
+            node.in_real_time = pace is not None
         ready(fleet)
         fleet.wait_for_all()
         if pace is not None:

@@ -38,10 +38,14 @@ class Hello:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Advance:
-    """It is now_s: hear these arrivals, run one period, then say Done."""
+    """It is now_s: hear these arrivals, run one period, then say Done.
+
+    in_real_time says whether the clock keeps pace with the wall's and waits for nobody.
+    """
 
     now_s: float
     arrivals: tuple[Arrival, ...] = ()
+    in_real_time: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

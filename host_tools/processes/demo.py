@@ -27,6 +27,8 @@ from host_tools.processes.voyage import Voyage, add_voyage_arguments, voyage_of
 from host_tools.writers import prepare_folder
 from protocol.errors import FathomError
 
+SHORTENED = ("duration_min=24", "follower_duration_min=18")
+"""Of paper-1: the first closures between the vehicles and what they mend, within three minutes."""
 GRACE_S = 5.0
 """Of real time, that a process is given to end before it is killed."""
 
@@ -122,6 +124,7 @@ def _last_line(child: _Child) -> str:
 
 def _configure(parser: argparse.ArgumentParser) -> None:
     add_voyage_arguments(parser)
+    parser.set_defaults(changes=list(SHORTENED))  # what --set gives comes later, and counts
     parser.add_argument(
         "--out", type=Path, default=Path("out/demo"), metavar="DIR", help="default: out/demo"
     )
@@ -132,8 +135,13 @@ def _run(arguments: argparse.Namespace) -> None:
     voyage = voyage_of(arguments)
     total_s = round(voyage.settings.scenario.duration_s)
     began_s = time.monotonic()
-    print(f"a leader and {voyage.settings.scenario.followers} follower(s), each a process of its")
-    print(f"own, survey {total_s / 60:.0f} minutes over a 1 kbit/s link; time is virtual")
+    scenario = voyage.settings.scenario
+    print(
+        f"{scenario.name} cut to {scenario.duration_min:g} minutes (--set duration_min=...), "
+        f"{1 + scenario.followers} vehicles, each a process, over a 1 kbit/s link that loses "
+        f"{scenario.water.loss:.0%}; time is virtual",
+        flush=True,
+    )
     with tqdm(total=total_s, unit="s", desc="mission", leave=False, disable=None) as bar:
         lines = run_demo(voyage, out, lambda now_s: advance(bar, now_s))
     print("\n".join(lines))

@@ -40,7 +40,8 @@ class Fleet:
         folder: Path | None = None,
         is_overdue: Callable[[float], bool] = lambda _: False,
     ) -> None:
-        self._mission, self._on_wait, self._is_overdue = mission, on_wait, is_overdue
+        self.water, self.on_wait = water, on_wait
+        self._mission, self._is_overdue = mission, is_overdue
         self._made = folder is None
         self.folder = Path(tempfile.mkdtemp(prefix="fathomlink-")) if folder is None else folder
         self._now_s = -1.0
@@ -87,7 +88,7 @@ class Fleet:
     def wait_for_all(self) -> None:
         """Wait until every vehicle's process is there."""
         while self.missing():
-            self._look()
+            self.look()
 
     def advance(self, now_s: float) -> None:
         """Serve a time to all processes at once: they work side by side."""
@@ -99,7 +100,7 @@ class Fleet:
     def until_answered(self, node: RemoteNode) -> None:
         """Wait for a process's answer; while it is down, for it to come back."""
         while not node.is_answered and not self._is_overdue(self._now_s):
-            self._look()
+            self.look()
 
     def end(self) -> None:
         """Tell all processes that the mission is over, and wait for their files."""
@@ -108,7 +109,7 @@ class Fleet:
             if node.line is not None:
                 node.line.send(End())
         while self._ended != {node.vehicle for node in self.nodes.values()}:
-            self._look()
+            self.look()
 
     def close(self) -> None:
         """Take the ports and the socket away."""
@@ -141,7 +142,7 @@ class Fleet:
         listener.listen(BACKLOG)
         return listener
 
-    def _look(self) -> None:
+    def look(self) -> None:
         """Wait a moment for anything that a process says, and act on it."""
         lines = [n.line for n in self.nodes.values() if n.line is not None] + self._strangers
         waited: list[socket.socket | ControlLine] = [self._socket, *lines]
@@ -154,7 +155,7 @@ class Fleet:
         for stranger in [line for line in self._strangers if line in ready]:
             self._meet(stranger)
         if not ready or self.missing():
-            self._on_wait(self.missing())
+            self.on_wait(self.missing())
 
     def _meet(self, stranger: ControlLine) -> None:
         """Let a new process join as the vehicle that it says it is."""

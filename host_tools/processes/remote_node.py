@@ -48,6 +48,7 @@ class RemoteNode:
         self.counters: Counter[str] = Counter()
         self.now_s = 0.0
         self.is_answered = True
+        self.in_real_time = False
         self._advance, self._until_answered, self._is_air_free = (
             advance,
             until_answered,
@@ -121,7 +122,7 @@ class RemoteNode:
             waiting.tries += 1
             self.port.write(wrap(waiting.frame))
         arrivals = tuple(waiting.arrival for waiting in self._told)
-        self.line.send(Advance(now_s=self.now_s, arrivals=arrivals))
+        self.line.send(Advance(now_s=self.now_s, arrivals=arrivals, in_real_time=self.in_real_time))
 
     def _keep_missed(self, missed: list[int]) -> None:
         again = []

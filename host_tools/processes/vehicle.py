@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware.clock import Clock, WallClock
+from firmware.clock import WallClock
 from firmware.dead_reckoning import DeadReckoning, ReckonedState
 from firmware.follower.core import FollowerCore
 from firmware.follower.loop import FollowerLoop
@@ -61,18 +61,19 @@ def run_vehicle(
         first_s = next(ticks, None)
         if first_s is None:
             return
-        in_real_time = isinstance(clock, WallClock)
         aboard = _board(vehicle, starts, modem, clock, voyage, files, first_s)
-        _sail(aboard, itertools.chain([first_s], ticks), in_real_time=in_real_time)
+        _sail(aboard, itertools.chain([first_s], ticks), on_wall=isinstance(clock, WallClock))
         aboard.worker.close()
         _write(aboard, voyage)
         if isinstance(clock, ServedClock):
             clock.end()
     finally:
+        if isinstance(clock, ServedClock):
+            clock.close()
         modem.close()
 
 
-def _sail(aboard: Aboard, ticks: Iterator[float], *, in_real_time: bool) -> None:
+def _sail(aboard: Aboard, ticks: Iterator[float], *, on_wall: bool) -> None:
     """Step the loop; Ctrl-C in real time ends the mission as its last tick does."""
     try:
         for now_s in ticks:
@@ -82,10 +83,10 @@ def _sail(aboard: Aboard, ticks: Iterator[float], *, in_real_time: bool) -> None
             core = aboard.loop.core
             if aboard.files is not None:
                 aboard.files.note(core.belief(), core.reckoned)
-            if in_real_time and now_s % STATUS_S == 0.0:
+            if on_wall and now_s % STATUS_S == 0.0:
                 print(_status_line(now_s, aboard.loop.status()), file=sys.stderr)
     except KeyboardInterrupt:
-        if not in_real_time:
+        if not on_wall:
             raise
 
 
@@ -93,7 +94,7 @@ def _board(
     vehicle: int,
     starts: int,
     modem: Modem,
-    clock: Clock,
+    clock: WallClock | ServedClock,
     voyage: Voyage,
     files: VehicleFiles | None,
     first_s: float,
@@ -106,7 +107,8 @@ def _board(
     steps: Iterator[SensorStep] = simulated.steps()
     start, steps = _navigated(deployed(simulated), steps, first_s)
     slots, epoch = Slots(settings.slots), starts % BOOT_EPOCHS
-    worker: Worker = ThreadWorker() if isinstance(clock, WallClock) else InlineWorker()
+    in_real_time = isinstance(clock, WallClock) or clock.in_real_time
+    worker: Worker = ThreadWorker() if in_real_time else InlineWorker()
     loop: FollowerLoop | LeaderLoop
     if vehicle == LEADER:
         leader = LeaderCore(epoch, start, settings=settings.leader, slots=slots)
@@ -134,7 +136,7 @@ def _navigated(
 
 def _modem_and_clock(
     vehicle: int, modem_url: str, clock_url: str, voyage: Voyage, start: str
-) -> tuple[Modem, Clock]:
+) -> tuple[Modem, WallClock | ServedClock]:
     if clock_url == WALL:
         modem = open_modem(modem_url)
         start_utc_s = start_time_s(start)

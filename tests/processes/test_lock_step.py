@@ -1,0 +1,228 @@
+"""The channel's end and a vehicle's end over real ptys, the vehicle in a thread."""
+
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from host_tools.mission import run
+from host_tools.processes.fleet import Fleet
+from host_tools.processes.remote_node import MOST_TRIES, RemoteNode
+from host_tools.processes.served_clock import ServedClock, StampedModem
+from protocol.acoustics import Delivery, Water, WaterSettings
+from protocol.errors import ConfigError, ModemUnavailable
+from protocol.framing import wrap
+from protocol.modems.base import Reception
+from protocol.modems.loopback import LoopbackMedium
+from protocol.modems.registry import open_modem
+
+TICK_S = 0.25
+QUIET = WaterSettings(loss=0.0, outlier_share=0.0)
+
+
+@dataclass
+class Talker:
+    """A vehicle that transmits its number and the time in its slot, and keeps what it hears."""
+
+    vehicle: int
+    fleet: Fleet
+    mission: str = "m"
+    stop_at_s: float = float("inf")
+    modem_of: int | None = None
+    heard: list[Reception] = field(default_factory=list)
+    sent: list[bytes] = field(default_factory=list)
+    error: Exception | None = None
+
+    def start(self) -> threading.Thread:
+        thread = threading.Thread(target=self.run, daemon=True)
+        thread.start()
+        return thread
+
+    def run(self) -> None:
+        port = self.vehicle if self.modem_of is None else self.modem_of
+        modem = StampedModem(open_modem(self.fleet.modem_url(port)))
+        clock = ServedClock(self.fleet.clock_url, self.vehicle, self.mission, modem)
+        try:
+            for now_s in clock.ticks(TICK_S):
+                if now_s >= self.stop_at_s:  # as a killed process: no answer, all lines cut
+                    return
+                self.step(now_s, modem)
+            clock.end()
+        except (ConfigError, ModemUnavailable) as error:
+            self.error = error
+        finally:
+            clock.close()
+            modem.close()
+
+    def step(self, now_s: float, modem: StampedModem) -> None:
+        modem.poll(now_s)
+        while (event := modem.next_event()) is not None:
+            if isinstance(event, Reception):
+                self.heard.append(event)
+        if now_s % 4.0 == 2.0 * self.vehicle and modem.status().is_up:
+            frame = bytes([self.vehicle, int(now_s) + 1]) * 8
+            self.sent.append(frame)
+            modem.send(frame, now_s)
+        modem.poll(now_s)
+
+
+def water(settings: WaterSettings = QUIET) -> Water:
+    return Water(settings, np.random.default_rng(1), lambda node, _: (300.0 * node, 0.0, 10.0))
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> Iterator[Fleet]:
+    made = water()
+    with Fleet(made, "m", on_wait=lambda _: None, folder=tmp_path / "ports") as fleet:
+        yield fleet
+
+
+def sail(
+    fleet: Fleet, duration_s: float = 30.0, at: Callable[[float], None] = lambda _: None
+) -> list[Delivery]:
+    deliveries: list[Delivery] = []
+    fleet.wait_for_all()
+    run(
+        fleet.nodes,
+        fleet.water,
+        duration_s=duration_s,
+        tick_s=TICK_S,
+        record=deliveries.append,
+        progress=at,
+    )
+    fleet.end()
+    return deliveries
+
+
+def heard_frames(talker: Talker) -> list[bytes]:
+    return [reception.frame for reception in talker.heard]
+
+
+def test_frames_and_times_of_arrival_cross_the_ports_unchanged(fleet: Fleet) -> None:
+    talkers = [Talker(vehicle, fleet) for vehicle in (0, 1)]
+    threads = [talker.start() for talker in talkers]
+    deliveries = sail(fleet)
+    for thread in threads:
+        thread.join()
+    for talker in talkers:
+        expected = [
+            (d.frame, d.t_rx_s, d.t_delivered_s)
+            for d in deliveries
+            if d.destination == talker.vehicle and d.was_received
+        ]
+        assert [(r.frame, r.toa_s, r.heard_s) for r in talker.heard] == expected
+        assert len(expected) >= 7
+
+
+def test_garbage_half_frames_and_foreign_traffic_cost_nothing_but_counts(fleet: Fleet) -> None:
+    talkers = [Talker(vehicle, fleet) for vehicle in (0, 1)]
+    threads = [talker.start() for talker in talkers]
+    noise = bytes(range(1, 200)) + wrap(b"not from this water") + wrap(b"half a frame")[:6]
+
+    def disturb(now_s: float) -> None:
+        if now_s % 3.0 == 0.25:
+            fleet.nodes[1].port.write(noise)
+
+    deliveries = sail(fleet, at=disturb)
+    for thread in threads:
+        thread.join()
+    water_frames = [d.frame for d in deliveries if d.destination == 1]
+    ours = [r for r in talkers[1].heard if r.toa_s is not None]
+    assert [r.frame for r in ours] == water_frames
+    foreign = [r for r in talkers[1].heard if r.toa_s is None]
+    assert {r.frame for r in foreign} >= {b"not from this water"}
+    assert heard_frames(talkers[0]) == [d.frame for d in deliveries if d.destination == 0]
+
+
+def test_a_port_that_vanishes_and_comes_back_loses_no_arrival(fleet: Fleet) -> None:
+    talkers = [Talker(vehicle, fleet) for vehicle in (0, 1)]
+    threads = [talker.start() for talker in talkers]
+
+    def pull(now_s: float) -> None:
+        if now_s == 9.0:
+            fleet.nodes[1].port.unplug()
+        if now_s == 17.0:
+            fleet.nodes[1].port.plug()
+
+    deliveries = sail(fleet, duration_s=40.0, at=pull)
+    for thread in threads:
+        thread.join()
+    assert heard_frames(talkers[1]) == [d.frame for d in deliveries if d.destination == 1]
+    assert heard_frames(talkers[0]) == talkers[1].sent
+    late = [r for r in talkers[1].heard if r.toa_s is not None and 9.0 < r.heard_s < 17.0]
+    assert len(late) == 2
+    assert all(abs((r.toa_s or 0.0) - r.heard_s) < 1.0 for r in late)
+
+
+def test_a_process_that_is_killed_is_waited_for_and_loses_nothing(tmp_path: Path) -> None:
+    with Fleet(water(), "m", on_wait=lambda _: None, folder=tmp_path) as fleet:
+        leader = Talker(0, fleet)
+        first = Talker(1, fleet, stop_at_s=12.75)
+        threads = [leader.start(), first.start()]
+        second = Talker(1, fleet)
+
+        def restart(missing: Sequence[RemoteNode]) -> None:
+            if missing and missing[0].now_s > 0.0 and len(threads) == 2:
+                assert missing[0].now_s == 12.75
+                threads.append(second.start())
+
+        fleet.on_wait = restart
+        deliveries = sail(fleet)
+        for thread in threads:
+            thread.join()
+    assert len(threads) == 3
+    both = heard_frames(first) + heard_frames(second)
+    assert both == [d.frame for d in deliveries if d.destination == 1]
+    assert [d.t_tx_s for d in deliveries if d.source == 1] == [2.0 + 4.0 * k for k in range(7)]
+
+
+def test_an_arrival_that_the_line_never_hands_over_is_given_up(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("host_tools.processes.served_clock.HANDOVER_S", 0.0)
+    monkeypatch.setattr(fleet.nodes[1].port, "write", lambda _: None)
+    talkers = [Talker(vehicle, fleet) for vehicle in (0, 1)]
+    threads = [talker.start() for talker in talkers]
+    sail(fleet, duration_s=11.0)
+    for thread in threads:
+        thread.join()
+    status = fleet.nodes[1].status()
+    assert talkers[1].heard == []
+    assert status["arrivals_lost_on_line"] == len(talkers[0].sent)
+    assert status["arrivals_repeated"] == (MOST_TRIES - 1) * len(talkers[0].sent)
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "mission", "message"),
+    [
+        (3, "m", "vehicle 3 is not in this mission; its vehicles are 0, 1"),
+        (1, "other", "follower_1 was started for another mission than the channel; give both"),
+        (0, "m", "leader is already here"),
+    ],
+)
+def test_a_process_that_does_not_belong_is_told_why(
+    vehicle: int, mission: str, message: str, fleet: Fleet
+) -> None:
+    leader = Talker(0, fleet)
+    threads = [leader.start()]
+    while fleet.nodes[0].line is None:
+        fleet.look()
+    stranger = Talker(vehicle, fleet, mission, modem_of=1)
+    threads.append(stranger.start())
+    while threads[1].is_alive():
+        fleet.look()
+    assert message in str(stranger.error)
+    fleet.close()
+    threads[0].join()
+    assert "has gone; start all again" in str(leader.error)
+
+
+def test_a_clock_that_is_not_there_is_one_line(tmp_path: Path) -> None:
+    modem = StampedModem(LoopbackMedium(water()).modem(0))
+    with pytest.raises(ModemUnavailable, match="start fathomlink channel first"):
+        ServedClock(f"unix://{tmp_path}/clock", 0, "m", modem)
+    with pytest.raises(ConfigError, match="give wall, or the unix:// name"):
+        ServedClock("clock", 0, "m", modem)

@@ -1,8 +1,8 @@
 """What the leader's answers teach a follower about its own dead reckoning.
 
-The state is how far dead reckoning has run away, and how fast: (c_n, c_e, b_n, b_e). It is kept at
-the time of the last state that an answer spoke of, because an answer is one to two minutes old;
-from there it is carried to any later time by the drift. Nothing here corrects dead reckoning itself.
+The state is how far dead reckoning has run away, and how fast: (c_n, c_e, b_n, b_e). It is kept
+at the time of the last state that an answer spoke of, because an answer is one to two minutes old;
+from there it is carried to any later time by the drift. Dead reckoning itself is never corrected.
 """
 
 from dataclasses import dataclass

@@ -98,12 +98,7 @@ class AbsoluteRecord:
 
 
 Record = (
-    PriorRecord
-    | OdometryRecord
-    | SharedDriftRecord
-    | ClosureRecord
-    | RangeRecord
-    | AbsoluteRecord
+    PriorRecord | OdometryRecord | SharedDriftRecord | ClosureRecord | RangeRecord | AbsoluteRecord
 )
 
 

@@ -114,7 +114,9 @@ def test_long_chain_without_closures_stays_solvable() -> None:
 def test_gap_in_a_track_is_bridged_by_composed_positions() -> None:
     track, _ = walk(np.random.default_rng(5), 300, 0.0)
     kept = (track.time_s < 100) | (track.time_s > 180)
-    gappy = Track(**{n: getattr(track, n)[kept] for n in ("time_s", "north_m", "east_m", "yaw_rad")})
+    gappy = Track(
+        **{n: getattr(track, n)[kept] for n in ("time_s", "north_m", "east_m", "yaw_rad")}
+    )
     graph = started(gappy)
     graph.update()
     estimate = graph.trajectory(0)

@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/ready
+FUZZ_SECONDS ?= 10
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
@@ -33,7 +34,10 @@ check: $(READY)
 	$(BIN)/lint-imports
 
 bench: $(READY)
+	$(BIN)/python -m benchmarks.wire
+	$(BIN)/python -m benchmarks.link
 	$(BIN)/python -m benchmarks.matching
+	$(BIN)/python -m benchmarks.map_vote
 	$(BIN)/python -m benchmarks.compression
 
 bench-compression: $(READY)
@@ -43,7 +47,8 @@ reproduce: $(READY)
 	$(BIN)/fathomlink reproduce --out out/reproduce
 
 fuzz: $(READY)
-	$(BIN)/python -m tests.fuzz.run --seconds 60
+	$(BIN)/python -m pip install --quiet --editable ".[fuzz]"
+	$(BIN)/python -m tests.fuzz.run --seconds $(FUZZ_SECONDS)
 
 wheel: $(READY)
 	sh .ci/wheel

@@ -1,0 +1,194 @@
+"""Whatever the packets say, the leader is bounded: a grid, or one EstimationError."""
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from firmware.compression import bitplanes, compress, packets_from
+from firmware.compression.expected import run
+from firmware.compression.mantissa import completed, fitting_steps, flagged, with_parity
+from firmware.compression.settings import CompressionSettings
+from firmware.compression.track_code import decode_track, encode_track
+from firmware.geometry import Array
+from firmware.leader.reconstruction import (
+    ReconstructionSettings,
+    reconstruct_packets,
+    reconstruct_points,
+)
+from firmware.submaps import Track
+from protocol.arithmetic import Decoder, Encoder
+from protocol.errors import EstimationError
+from protocol.packets import Header, Profile, SubmapFragment
+from tests.compression.conftest import Survey, relief_m
+
+RNG = np.random.default_rng(3)
+PLACES_M = RNG.uniform([-40.0, -70.0], [40.0, 70.0], (150, 2))
+POINTS = np.column_stack([PLACES_M, relief_m(*PLACES_M.T)])
+TRACK = Track(
+    time_s=np.arange(40.0),
+    north_m=np.arange(40.0),
+    east_m=np.zeros(40),
+    yaw_rad=np.zeros(40),
+)
+ABSURD = [0.0, -0.0, 1e-30, 1e30, -1e30, float("nan"), float("inf"), -float("inf"), 1.0]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.sampled_from(ABSURD), min_size=4, max_size=4))
+def test_absurd_hyperparameters_give_a_bounded_grid_or_one_error(values: list[float]) -> None:
+    hyper = np.array(values)
+    try:
+        grid = reconstruct_points(POINTS, hyper, TRACK, ReconstructionSettings())
+    except EstimationError:
+        return
+    assert grid.depth_m.size < 10_000
+
+
+@pytest.mark.parametrize("far_m", [1e4, 1e6, 1e20, np.nan])
+def test_points_far_away_do_not_make_the_grid_grow(far_m: float) -> None:
+    points = POINTS.copy()
+    points[0, 0] = far_m
+    bounds = ReconstructionSettings(cell_m=0.1, max_cells=20_000)
+    grid = reconstruct_points(points, np.array([-0.1, 0.01, 0.01, 40.0]), TRACK, bounds)
+    assert grid.depth_m.size <= 20_000
+
+
+def test_points_on_a_line_are_told() -> None:
+    points = np.column_stack([np.arange(20.0), np.arange(20.0), np.full(20, 40.0)])
+    with pytest.raises(EstimationError, match="line"):
+        reconstruct_points(points, np.array([0.1, 1.0, 0.1, 40.0]), TRACK, ReconstructionSettings())
+
+
+@pytest.mark.parametrize("lost", [{0}, {3, 4}, {1, 5, 9}, {0, 2, 4, 6}])
+def test_parity_in_the_mantissas_gives_lost_points_back(lost: set[int]) -> None:
+    steps = fitting_steps(POINTS, 40.0)
+    assert steps is not None
+    mean_m = flagged(40.0, steps)
+    wired = with_parity(POINTS, steps).reshape(10, 15, 3)
+    whole, none = completed(dict(enumerate(wired)), mean_m)
+    arrived = {i: wired[i] for i in range(10) if i not in lost}
+    points, recovered = completed(arrived, mean_m)
+    assert none == 0
+    assert recovered == 15 * len(lost)
+    assert {tuple(p) for p in points} == {tuple(p) for p in whole}
+    assert np.abs(whole - POINTS).max() <= 0.5 * steps.sizes_m.max() + 1e-9
+    assert np.abs(wired.reshape(-1, 3) - whole).max() <= 0.5 * steps.sizes_m.max()
+
+
+def test_five_lost_packets_leave_the_points_that_came() -> None:
+    steps = fitting_steps(POINTS, 40.0)
+    assert steps is not None
+    wired = with_parity(POINTS, steps).reshape(10, 15, 3)
+    points, recovered = completed({i: wired[i] for i in range(5)}, flagged(40.0, steps))
+    assert (len(points), recovered) == (75, 0)
+
+
+def test_points_of_another_sender_with_the_flag_by_chance_are_left_alone() -> None:
+    parts = {i: POINTS.astype(np.float32).reshape(10, 15, 3)[i] for i in range(8)}
+    steps = fitting_steps(POINTS, 40.0)
+    points, recovered = completed(parts, flagged(40.0, steps))
+    assert (len(points), recovered) == (120, 0)
+
+
+def turning_track() -> Track:
+    second = np.arange(40.0)
+    yaw_rad = np.clip((second - 10.0) * 0.16, 0.0, np.pi)
+    north_m = 3000.0 + np.cumsum(2.0 * np.cos(yaw_rad))
+    east_m = -700.0 + np.cumsum(2.0 * np.sin(yaw_rad))
+    return Track(time_s=second, north_m=north_m, east_m=east_m, yaw_rad=yaw_rad)
+
+
+def test_a_turning_track_fits_forty_bytes_within_a_metre() -> None:
+    data = encode_track(turning_track())
+    track, taken = decode_track(data + b"more", 0.0)
+    assert taken == len(data) <= 46
+    assert np.abs(track.north_m - turning_track().north_m).max() < 1.0
+    assert np.abs(track.east_m - turning_track().east_m).max() < 1.0
+
+
+@pytest.fixture(scope="module")
+def fragments(survey: Survey) -> list[SubmapFragment]:
+    header = Header(
+        profile=Profile.SUBMAP_LATTICE,
+        vehicle=1,
+        boot_epoch=0,
+        submap=0,
+        fragment=0,
+        fragment_count=10,
+        tx_second=0,
+        time_quarters=0,
+    )
+    compressed = compress(survey.bins, CompressionSettings(), "lattice")
+    packets = packets_from(compressed, survey.track, header)
+    return [packet for packet in packets if isinstance(packet, SubmapFragment)]
+
+
+def error_m(fragments: list[SubmapFragment], kept: list[int]) -> float:
+    arrived = {i: fragments[i] for i in kept}
+    grid = reconstruct_packets(arrived, ReconstructionSettings(max_variance_m2=9.0), 0.0).grid
+    axes = [
+        first + grid.cell_m * np.arange(length)
+        for first, length in zip((grid.north0_m, grid.east0_m), grid.depth_m.shape, strict=True)
+    ]
+    true_m: Array = relief_m(*np.meshgrid(*axes, indexing="ij"))
+    return float(np.sqrt(np.nanmean((grid.depth_m - true_m) ** 2)))
+
+
+def test_two_lattice_frames_of_ten_give_a_usable_map(fragments: list[SubmapFragment]) -> None:
+    assert error_m(fragments, [2, 7]) < 0.3  # m, of a relief of 1.3 m
+    assert error_m(fragments, list(range(10))) < 0.05
+
+
+def test_every_further_byte_of_the_code_brings_the_coefficients_nearer() -> None:
+    rng = np.random.default_rng(6)
+    fall = 1.0 + np.add.outer(np.arange(40.0) ** 2, np.arange(30.0) ** 2)
+    coefficients_m = rng.normal(size=(40, 30)) * 20.0 / fall**0.7
+    encoder = Encoder()
+    run(bitplanes.encode_steps(coefficients_m, encoder, 600))
+    code = encoder.finish()
+    misses = [
+        float(np.sum((bitplanes.decode((40, 30), Decoder(code[:cut])) - coefficients_m) ** 2))
+        for cut in range(0, 600, 50)
+    ]
+    assert all(later <= earlier for earlier, later in itertools.pairwise(misses))
+    assert misses[-1] < 1e-3 * misses[0]
+
+
+def test_any_two_lattice_frames_are_as_good_as_any_other_two(
+    fragments: list[SubmapFragment],
+) -> None:
+    assert error_m(fragments, [0, 1]) == pytest.approx(error_m(fragments, [4, 9]))
+
+
+def test_one_lattice_frame_gives_no_map(fragments: list[SubmapFragment]) -> None:
+    with pytest.raises(EstimationError):
+        reconstruct_packets({3: fragments[3]}, ReconstructionSettings(), 0.0)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.sampled_from(["dense", "lattice"]))
+def test_damaged_bodies_give_a_grid_or_one_error(seed: int, changes: int, profile: str) -> None:
+    rng = np.random.default_rng(seed)
+    body = bytearray(rng.integers(0, 256, 244, dtype=np.uint8).tobytes())
+    body[:4] = bytes([2 << 4 | 2, 2, 255, 0])
+    body[4:6] = bytes([39, 0x11])
+    kind = Profile.SUBMAP_DENSE if profile == "dense" else Profile.SUBMAP_LATTICE
+    header = Header(
+        profile=kind,
+        vehicle=1,
+        boot_epoch=0,
+        submap=0,
+        fragment=0,
+        fragment_count=changes % 15 + 1,
+        tx_second=0,
+        time_quarters=0,
+    )
+    arrived = {i: SubmapFragment(header=header, body=bytes(body)) for i in range(2)}
+    try:
+        found = reconstruct_packets(arrived, ReconstructionSettings(max_cells=50_000), 0.0)
+    except EstimationError:
+        return
+    assert found.grid.depth_m.size <= 50_000

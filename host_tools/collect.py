@@ -142,11 +142,10 @@ def vehicle_result(
 def final_covariances(vehicle: int, time_s: Array, leader: LeaderCore) -> Array:
     """Return the covariance (T, 2, 2) of a vehicle's final estimate, NaN between samples."""
     covariances_m2 = np.full((len(time_s), 2, 2), np.nan)
-    track = leader.track(vehicle)
     rows, anchors = [], []
     for row in range(0, len(time_s), COVARIANCE_STEP):
         try:
-            anchors.append(leader.graph.anchor(vehicle, float(time_s[row]), track))
+            anchors.append(leader.anchor(vehicle, float(time_s[row])))
         except EstimationError:
             continue  # later than the leader's last news of the vehicle
         rows.append(row)

@@ -154,7 +154,7 @@ class _BitwiseEqual:
         return hash(self._key())
 
 
-def usable_states(states: Array32) -> NDArray[np.bool_]:
+def usable_states(states: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Return (T,) which of the states (T, 3) north, east, yaw mean something."""
     near = np.abs(states[:, :2]) <= FARTHEST_M
     return np.asarray(np.isfinite(states).all(axis=1) & near.all(axis=1))

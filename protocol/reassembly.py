@@ -33,6 +33,12 @@ class ReassemblySettings(Settings):
         "after a newer sub-map began: two slots of repeats and the longest travel time",
         minimum=0.0,
     )
+    repeated_s: float = setting(
+        60.0, "s", "the same where the sender has air for repeats: five rounds of them", minimum=0.0
+    )
+    fragments_with_repeats: int = setting(
+        0, "fragments", "transfers of so many or fewer are repeated; 0: none is", minimum=0
+    )
     oldest_s: float = setting(
         240.0,
         "s",
@@ -152,7 +158,7 @@ class Reassembler:
         """Close the transfers whose deadline has passed."""
         for key, slot in list(self._slots.items()):
             overtaken = slot.overtaken_at_s
-            if overtaken is not None and now_s - overtaken >= self._settings.overtaken_s:
+            if overtaken is not None and now_s - overtaken >= self._patience_s(slot):
                 self._close(key, "overtaken")
             elif now_s - slot.first_arrival_s >= self._settings.oldest_s:
                 self._close(key, "too-old")
@@ -234,6 +240,11 @@ class Reassembler:
                 reason=reason,
             )
         )
+
+    def _patience_s(self, slot: _Slot) -> float:
+        s = self._settings
+        repeats = slot.first.header.fragment_count <= s.fragments_with_repeats
+        return s.repeated_s if repeats else s.overtaken_s
 
     def _push(self, event: ReassemblyEvent) -> None:
         if len(self._events) == self._settings.queued_events:

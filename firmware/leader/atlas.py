@@ -11,17 +11,36 @@ from firmware.leader.trajectory import Trajectory
 from firmware.leader.warping import remove_drift
 from firmware.submaps import GriddedSubmap, Track
 
+LEADER = 0
+BOOT_EPOCHS = 16
+"""The header has four bits each for the vehicle and its boot epoch."""
+
 FOOTPRINT_M = 10.0
 """Tiles in which footprints are compared: a tenth of a sub-map."""
 
 
+def chain_of(vehicle: int, boot: int) -> int:
+    """Return the number of the graph's chain that a boot of a vehicle is; the leader has one."""
+    return LEADER if vehicle == LEADER else boot * BOOT_EPOCHS + vehicle
+
+
+def vehicle_of(chain: int) -> int:
+    """Return the vehicle whose chain it is."""
+    return chain % BOOT_EPOCHS
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SheetId:
-    """Which sub-map of which vehicle, in which of its boot epochs."""
+    """Which sub-map of which vehicle, in which of its boots: epochs counted on without a wrap."""
 
     vehicle: int
     boot_epoch: int
     submap: int
+
+    @property
+    def chain(self) -> int:
+        """The chain of the graph that it was measured from."""
+        return chain_of(self.vehicle, self.boot_epoch)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

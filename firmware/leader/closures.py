@@ -103,10 +103,10 @@ def jobs_for(
 ) -> list[MatchJob]:
     """Return the matches worth trying for a new sheet, most overlap first, bounded in number."""
     ranked = _ranked(sheet, atlas, graph, settings)
-    grid, drift_mps = sheet.without_drift(graph.trajectory(sheet.id.vehicle))
+    grid, drift_mps = sheet.without_drift(graph.trajectory(sheet.id.chain))
     jobs = []
     for other, covariance_m2 in ranked[: settings.pairs_per_submap]:
-        other_grid, other_drift_mps = other.without_drift(graph.trajectory(other.id.vehicle))
+        other_grid, other_drift_mps = other.without_drift(graph.trajectory(other.id.chain))
         jobs.append(
             MatchJob(
                 origin=other,
@@ -140,7 +140,7 @@ def closure_of(
         (job.target, job.target_drift_mps, found.query_time_s),
     ):
         ends_m.append(sheet.reckoned_at(time_s) - drift_mps * (time_s - sheet.time_s))
-        anchors.append(graph.anchor(sheet.id.vehicle, time_s, sheet.track))
+        anchors.append(graph.anchor(sheet.id.chain, time_s, sheet.track))
     return Closure(
         time_s=now_s,
         origin=job.origin.id,
@@ -187,7 +187,7 @@ def count_stages(closures: Iterable[Closure]) -> dict[str, int]:
 
 
 def _correction(sheet: Sheet, graph: PoseGraph) -> Array:
-    trajectory = graph.trajectory(sheet.id.vehicle)
+    trajectory = graph.trajectory(sheet.id.chain)
     reckoned_m = sheet.reckoned_at(sheet.time_s)
     return trajectory.correct(sheet.time_s, reckoned_m) - reckoned_m
 
@@ -234,4 +234,4 @@ def _spread(covariance_m2: Array) -> Array:
 
 
 def _anchor(sheet: Sheet, graph: PoseGraph) -> Anchor:
-    return graph.anchor(sheet.id.vehicle, sheet.time_s, sheet.track)
+    return graph.anchor(sheet.id.chain, sheet.time_s, sheet.track)

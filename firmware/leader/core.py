@@ -13,36 +13,37 @@ import numpy as np
 
 from firmware.belief import Belief
 from firmware.dead_reckoning import DeadReckoning, ReckonedState
-from firmware.leader.atlas import Atlas, Sheet, SheetId, sheet_of
+from firmware.leader.answers import Answers
+from firmware.leader.atlas import LEADER, Atlas, Sheet, SheetId, sheet_of
 from firmware.leader.closures import Closure, MatchJob, closure_of, gate, jobs_for
+from firmware.leader.fleet import Fleet
 from firmware.leader.judgement import Judgement
+from firmware.leader.ledger import Anchor
 from firmware.leader.matching import MatchOutcome
 from firmware.leader.own_grid import grid_of
 from firmware.leader.pose_graph import PoseGraph
 from firmware.leader.ranging import Ranging
-from firmware.leader.reconstruction import reconstruct_packets
+from firmware.leader.reconstruction import reconstruct_packets, states_of_fragment
 from firmware.leader.settings import LeaderSettings
-from firmware.leader.tracks import TrackBuffer
 from firmware.leader.trajectory import Trajectory
 from firmware.soundings import Odometry, Ping
 from firmware.submap_builder import SubmapBuilder
 from firmware.submaps import Submap, Track, joined
 from protocol.codec import decode, encode
 from protocol.errors import EstimationError, RemoteProtocolError
-from protocol.packets import (
-    Answer,
-    Header,
-    Profile,
-    SubmapFragment,
-    SubmapPacket,
-    TrajectoryPacket,
-    usable_states,
+from protocol.packets import Header, SubmapFragment, SubmapPacket, TrajectoryPacket
+from protocol.reassembly import (
+    FragmentArrived,
+    Reassembler,
+    ReassemblySettings,
+    SubmapTransfer,
 )
-from protocol.reassembly import FragmentArrived, Reassembler, SubmapTransfer
 from protocol.schedule import Slots
-from protocol.timestamps import from_quarters, to_quarters, to_tx_second
+from protocol.timestamps import from_quarters
 
-LEADER = 0
+_OFF_TRACK_M = 5.0  # a sub-map's own states are those of the track, to the wire's quantisation
+_RANGE_WINDOW_S = 20.0  # five frames: enough to tell true ranges from stretched ones together
+_SUPERFRAME_S = 60.0  # a slot that lies farther ahead was computed before the clock was set back
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,14 +56,6 @@ class SheetJobs:
     def run(self) -> list[MatchOutcome]:
         """Run all matches, in order."""
         return [job.run() for job in self.jobs]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _LatestAnswer:
-    """The last known state of a follower's newest sub-map."""
-
-    sheet_id: SheetId
-    time_s: float
 
 
 class LeaderCore:
@@ -87,14 +80,16 @@ class LeaderCore:
         )
         hops = max(1, round(settings.submaps.duration_s / settings.hop_s))
         self._stretches: deque[Submap] = deque(maxlen=hops)
-        self._reassembler = Reassembler(settings.reassembly)
+        self._reassembler = Reassembler(_patient(settings, slots))
         self._ranging = Ranging(settings.ranges)
+        self.fleet = Fleet(self.graph, self._ranging, settings.fleet)
+        self._answers = Answers(
+            boot_epoch, self.fleet, self.graph, extended=settings.answers == "extended"
+        )
         self._judgement = Judgement(settings.judgement, settings.matching)
         self._sheets_judged = 0
-        self._tracks: dict[int, TrackBuffer] = {LEADER: TrackBuffer()}
         self._sheets_to_match: deque[Sheet] = deque(maxlen=16)
-        self._answers: dict[int, _LatestAnswer] = {}
-        self._answers_sent = 0
+        self._ranges_used_s: dict[int, float] = {}
         self._next_slot_s = slots.next_slot_s(LEADER, start.time_s)
         start_m = np.array([start.north_m, start.east_m])
         self.graph.add_vehicle(LEADER, start.time_s, start_m, start_m)
@@ -105,7 +100,7 @@ class LeaderCore:
         """Advance dead reckoning; a finished sub-map becomes a sheet of the atlas."""
         state = self._reckoning.receive_odometry(odometry)
         self._builder.receive_state(state)
-        track = self._tracks[LEADER]
+        track = self.fleet.own
         if not len(track) or state.time_s == math.floor(state.time_s):
             track.add(state.time_s, state.north_m, state.east_m, state.yaw_rad)
         submap = self._builder.take()
@@ -123,20 +118,21 @@ class LeaderCore:
         except RemoteProtocolError:
             self.counters["frames_rejected"] += 1
             return
-        if packet.header.vehicle == LEADER or isinstance(packet, Answer):
+        header = packet.header
+        if not isinstance(packet, SubmapPacket | SubmapFragment | TrajectoryPacket):
             self.counters["frames_not_for_us"] += 1
             return
-        if isinstance(packet, SubmapPacket | SubmapFragment):
-            self._reassembler.receive(packet, now_s)
-        elif isinstance(packet, TrajectoryPacket):
-            self._receive_states(packet.header, packet.states, now_s)
-            self._extend(packet.header.vehicle)
-        else:
-            self.counters["frames_not_for_us"] += 1
+        if not 1 <= header.vehicle <= self._slots.settings.followers:
+            self.counters["frames_of_unknown_vehicles"] += 1
             return
         self.counters["frames_received"] += 1
         if toa_s is not None:
-            self._ranging.hold(packet.header, toa_s)
+            self._ranging.hold(self.fleet.chain(header), header, toa_s)
+        if isinstance(packet, TrajectoryPacket):
+            first_s = from_quarters(header.time_quarters, now_s)
+            self._receive_states(header, first_s, packet.states, now_s)
+        else:
+            self._reassembler.receive(packet, now_s)
 
     # what is done
 
@@ -145,9 +141,7 @@ class LeaderCore:
         self._reassembler.advance(now_s)
         while (event := self._reassembler.next_event()) is not None:
             if isinstance(event, FragmentArrived):
-                if isinstance(event.fragment, SubmapPacket):
-                    header = event.fragment.header
-                    self._receive_states(header, event.fragment.trajectory, now_s)
+                self._receive_fragment(event.fragment, now_s)
             else:
                 self._add_transfer(event)
 
@@ -188,19 +182,15 @@ class LeaderCore:
 
     def poll(self, now_s: float) -> bytes | None:
         """Return the answer to transmit now, or None; followers take turns."""
-        if now_s < self._next_slot_s - 1e-6:
+        if self._next_slot_s - _SUPERFRAME_S < now_s < self._next_slot_s - 1e-6:
             return None
+        slot_s = self._slots.next_slot_s(LEADER, now_s)
         self._next_slot_s = self._slots.next_slot_s(LEADER, now_s + 1e-3)
-        if not self._answers:
+        if slot_s > now_s + 1e-6:
+            self.counters["slots_missed"] += 1
             return None
-        vehicles = sorted(self._answers)
-        vehicle = vehicles[self._answers_sent % len(vehicles)]
-        answer = self._answer(vehicle, self._answers[vehicle], now_s)
-        if answer is None:
-            return None
-        self._answers_sent = (self._answers_sent + 1) % (1 << 16)
-        self.counters["answers_sent"] += 1
-        return encode(answer)
+        answer = self._answers.next_answer(self.belief(), self._reassembler, now_s)
+        return None if answer is None else encode(answer)
 
     def belief(self) -> Belief:
         """Return where the leader believes itself to be now."""
@@ -219,20 +209,33 @@ class LeaderCore:
 
     def vehicles(self) -> list[int]:
         """Return the vehicles whose trajectories are known, the leader first."""
-        return self.graph.vehicles()
+        return self.fleet.vehicles()
 
     def track(self, vehicle: int) -> Track:
         """Return the raw dead-reckoned track of a vehicle, as far as it is known here."""
-        return self._tracks[vehicle].track()
+        return self.fleet.whole_track(vehicle)
 
     def trajectory(self, vehicle: int) -> Trajectory:
-        """Return the smoothed estimate of a vehicle's trajectory."""
-        return self.graph.trajectory(vehicle)
+        """Return the smoothed estimate of a vehicle's trajectory, over all of its boots."""
+        return self.fleet.whole_trajectory(vehicle)
+
+    def anchor(self, vehicle: int, time_s: float) -> Anchor:
+        """Return where in the graph a vehicle's position at the time hangs.
+
+        Raises
+        ------
+        EstimationError
+            If nothing is known of that time.
+        """
+        chain = self.fleet.chain_at(vehicle, time_s)
+        return self.graph.anchor(chain, time_s, self.fleet.track(chain))
 
     def status(self) -> dict[str, int]:
         """Return every counter: what came, what was used, what was dropped and why."""
         return {
             **self.counters,
+            **self.fleet.counters,
+            **self._answers.counters,
             **self._ranging.counters,
             **self._judgement.counters,
             **{f"reassembly_{k}": v for k, v in _counters_of(self._reassembler).items()},
@@ -246,7 +249,7 @@ class LeaderCore:
 
     def _add_own(self, stretch: Submap) -> None:
         """Join the newest stretches to a sub-map, so that one ends every hop."""
-        self.graph.extend(LEADER, self.track(LEADER))
+        self.graph.extend(LEADER, self.fleet.own.track())
         self._stretches.append(stretch)
         submap = joined(list(self._stretches))
         if submap.bins.depth_m.size < self._settings.submaps.minimum_cells:
@@ -257,10 +260,11 @@ class LeaderCore:
         self._add_sheet(sheet_of(sheet_id, submap.track, grid, reconstructed=False))
 
     def _add_transfer(self, transfer: SubmapTransfer) -> None:
-        """Rebuild a sub-map from the fragments that arrived; its last state is to be answered."""
-        vehicle = transfer.vehicle
-        self._extend(vehicle)
-        sheet_id = SheetId(vehicle=vehicle, boot_epoch=transfer.boot_epoch, submap=transfer.submap)
+        """Rebuild a sub-map from the fragments that arrived."""
+        header = next(iter(transfer.fragments.values())).header
+        boot = self.fleet.boot_of(header)
+        sheet_id = SheetId(vehicle=header.vehicle, boot_epoch=boot, submap=header.submap)
+        self._use_ranges(sheet_id.chain)
         try:
             rebuilt = reconstruct_packets(
                 transfer.fragments, self._settings.reconstruction, transfer.first_arrival_s
@@ -270,10 +274,22 @@ class LeaderCore:
             return
         if rebuilt.track.time_s.size == 0:
             self.counters["submaps_without_track"] += 1
-            return
-        last_s = float(rebuilt.track.time_s[-1])
-        self._answers[vehicle] = _LatestAnswer(sheet_id=sheet_id, time_s=last_s)
-        self._add_sheet(sheet_of(sheet_id, rebuilt.track, rebuilt.grid, reconstructed=True))
+        elif not self._is_on_track(sheet_id.chain, rebuilt.track):
+            self.counters["submaps_off_track"] += 1
+        else:
+            self._add_sheet(sheet_of(sheet_id, rebuilt.track, rebuilt.grid, reconstructed=True))
+
+    def _is_on_track(self, chain: int, track: Track) -> bool:
+        """Return whether a sub-map was measured where its chain was, so that it can be placed."""
+        try:
+            known = self.fleet.track(chain)
+            for time_s in (track.time_s[0], track.time_s[-1]):
+                self.graph.anchor(chain, float(time_s), known)
+        except (EstimationError, KeyError):
+            return False
+        reckoned_m = np.column_stack([track.north_m, track.east_m])
+        apart_m = np.hypot(*(known.position_at(track.time_s) - reckoned_m).T)
+        return bool(apart_m.max() <= _OFF_TRACK_M)
 
     def _add_sheet(self, sheet: Sheet | None) -> None:
         if sheet is None:
@@ -282,51 +298,44 @@ class LeaderCore:
         self.atlas.add(sheet)
         self._sheets_to_match.append(sheet)
 
-    def _receive_states(self, header: Header, states: np.ndarray, now_s: float) -> None:
+    def _receive_fragment(self, fragment: SubmapPacket | SubmapFragment, now_s: float) -> None:
+        """Take the states that a fragment carries; they are of use before its sub-map is."""
+        header = fragment.header
         first_s = from_quarters(header.time_quarters, now_s)
-        buffer = self._tracks.setdefault(header.vehicle, TrackBuffer())
-        for k in np.flatnonzero(usable_states(states)):
-            if first_s + k <= now_s:
-                buffer.add(first_s + float(k), *(float(value) for value in states[k]))
-            else:
-                self.counters["states_from_the_future"] += 1
-
-    def _extend(self, vehicle: int) -> None:
-        """Let a follower's chain grow by its known track, and use the ranges that this frees."""
-        buffer = self._tracks.get(vehicle)
-        if buffer is None or not len(buffer):
+        if isinstance(fragment, SubmapPacket):
+            self._receive_states(header, first_s, fragment.trajectory, now_s)
             return
-        track = buffer.track()
-        if vehicle not in self.graph.vehicles():
-            start_m = np.array([track.north_m[0], track.east_m[0]])
-            self.graph.add_vehicle(vehicle, float(track.time_s[0]), start_m, start_m)
-        self.graph.extend(vehicle, track)
-        self.graph.extend(LEADER, self.track(LEADER))
-        self._ranging.use(vehicle, track, LEADER, self.track(LEADER), self.graph)
-
-    def _answer(self, vehicle: int, latest: _LatestAnswer, now_s: float) -> Answer | None:
         try:
-            anchor = self.graph.anchor(vehicle, latest.time_s, self.track(vehicle))
+            states = states_of_fragment(fragment)
         except EstimationError:
-            self.counters["answers_unplaceable"] += 1
-            return None
-        position_m = self.graph.position(anchor)
-        header = Header(
-            profile=Profile.ANSWER,
-            vehicle=LEADER,
-            boot_epoch=self.boot_epoch,
-            submap=self._answers_sent,
-            fragment=vehicle,
-            fragment_count=latest.sheet_id.boot_epoch,
-            tx_second=to_tx_second(round(now_s)),
-            time_quarters=to_quarters(latest.time_s),
-        )
-        return Answer(
-            header=header,
-            submap=latest.sheet_id.submap,
-            north_m=float(np.float32(position_m[0])),
-            east_m=float(np.float32(position_m[1])),
-        )
+            self.counters["fragments_without_track"] += 1
+            return
+        self._receive_states(header, first_s, states, now_s)
+
+    def _receive_states(
+        self, header: Header, first_s: float, states: np.ndarray, now_s: float
+    ) -> None:
+        last_s = self.fleet.receive_states(header, first_s, states, now_s)
+        if last_s is None:
+            return
+        chain = self.fleet.chain(header)
+        self._answers.note(header, chain, last_s)
+        if last_s >= self._ranges_used_s.get(chain, -np.inf) + _RANGE_WINDOW_S:
+            self._ranges_used_s[chain] = last_s
+            self._use_ranges(chain)
+
+    def _use_ranges(self, chain: int) -> None:
+        """Let a follower's chain grow by its known track, and use the ranges that this frees."""
+        self.fleet.extend(chain)
+        self.fleet.use_ranges(chain)
+
+
+def _patient(settings: LeaderSettings, slots: Slots) -> ReassemblySettings:
+    """Return the reassembly's settings: it waits longer where followers have air for repeats."""
+    if settings.answers != "extended":
+        return settings.reassembly
+    room = slots.frames_per_submap(settings.submaps.duration_s)
+    return dataclasses.replace(settings.reassembly, fragments_with_repeats=max(room - 1, 0))
 
 
 def _counters_of(reassembler: Reassembler) -> dict[str, int]:

@@ -133,7 +133,7 @@ class Judgement:
         graph: PoseGraph,
     ) -> VoteWindow:
         shift_m = closure.offset_m - (closure.target_reckoned_m - closure.origin_reckoned_m)
-        trajectories = [graph.trajectory(sheet.id.vehicle) for sheet in matched]
+        trajectories = [graph.trajectory(sheet.id.chain) for sheet in matched]
         (reference, reference_drift), (query, query_drift) = (
             sheet.without_drift(trajectory)
             for sheet, trajectory in zip(neighbours, trajectories, strict=True)
@@ -165,8 +165,8 @@ class _Odometry:
             end
             for c in closures
             for end in (
-                (c.origin.vehicle, c.origin_anchor.time_s, c.origin_reckoned_m),
-                (c.target.vehicle, c.target_anchor.time_s, c.target_reckoned_m),
+                (c.origin.chain, c.origin_anchor.time_s, c.origin_reckoned_m),
+                (c.target.chain, c.target_anchor.time_s, c.target_reckoned_m),
             )
         ]
         self._settings = settings
@@ -203,7 +203,7 @@ def _neighbour_pairs(origin: Sheet, target: Sheet, atlas: Atlas) -> list[tuple[S
     """Return pairs of sub-maps measured just before or after the matched ones, nearest first."""
 
     def near(sheet: Sheet) -> list[Sheet]:
-        same = [o for o in atlas if o.id.vehicle == sheet.id.vehicle and o.id != sheet.id]
+        same = [o for o in atlas if o.id.chain == sheet.id.chain and o.id != sheet.id]
         apart = [(abs(o.time_s - sheet.time_s), k) for k, o in enumerate(same)]
         return [same[k] for gap_s, k in sorted(apart) if _NEXT_S[0] < gap_s < _NEXT_S[1]]
 

@@ -101,8 +101,21 @@ class PoseGraph:
         self._newest_covariance: dict[int, Array] = {}
         self.rebuilds = 0
 
-    def add_vehicle(self, vehicle: int, time_s: float, reckoned_m: Array, start_m: Array) -> None:
-        """Start a vehicle's chain at a position (2,) known to the settings' uncertainty."""
+    def add_vehicle(
+        self,
+        vehicle: int,
+        time_s: float,
+        reckoned_m: Array,
+        start_m: Array,
+        *,
+        start_sigma_m: float | None = None,
+        like: int | None = None,
+    ) -> None:
+        """Start a vehicle's chain at a position (2,), as uncertain as the settings say, or as told.
+
+        Its drift is like that of the first chain; or of the chain `like`, an earlier boot's, whose
+        newest drift it goes on with.
+        """
         s = self._settings
         number = len(self._chains)
         chain = _Chain(number=number, parameters=gtsam.symbol("p", number))
@@ -110,16 +123,20 @@ class PoseGraph:
         state = np.concatenate([start_m, np.zeros(2)])
         key = self._append(chain, time_s, reckoned_m, state)
         self._fresh.insert(chain.parameters, np.zeros(2))
-        sigmas = np.repeat([s.start_sigma_m, s.bias_sigma_mps], 2)
+        sigmas = np.repeat([start_sigma_m or s.start_sigma_m, s.bias_sigma_mps], 2)
         self._enter(PriorRecord(key=key, mean=state, sigmas=sigmas))
         calibration = np.array([np.radians(s.heading_bias_sigma_deg), s.log_scale_sigma])
         self._enter(PriorRecord(key=chain.parameters, mean=np.zeros(2), sigmas=calibration))
         if number > 0:
-            first = next(iter(self._chains.values()))
+            first = next(iter(self._chains.values())) if like is None else self._chains[like]
             nearest = int(np.argmin(np.abs(np.asarray(first.times_s) - time_s)))
+            gap_s = abs(time_s - first.times_s[nearest])
+            wandered_mps = float(s.bias_walk * np.sqrt(gap_s + s.node_interval_s))
             self._enter(
                 SharedDriftRecord(
-                    origin=first.keys[nearest], target=key, sigma_mps=s.bias_difference_mps
+                    origin=first.keys[nearest],
+                    target=key,
+                    sigma_mps=s.bias_difference_mps if like is None else wandered_mps,
                 )
             )
 

@@ -18,7 +18,7 @@ from protocol.timestamps import transmission_s
 class _HeldRange:
     """A range whose sender's track arrives only later."""
 
-    vehicle: int
+    chain: int
     sent_s: float
     arrived_s: float
     range_m: float
@@ -44,14 +44,14 @@ class Ranging:
         self._judge = RangeJudge(settings)
         self._held: deque[_HeldRange] = deque(maxlen=settings.held)
 
-    def hold(self, header: Header, toa_s: float) -> None:
+    def hold(self, chain: int, header: Header, toa_s: float) -> None:
         """Keep the range that a frame's arrival tells, until its sender's track is known."""
         if len(self._held) == self._held.maxlen:
             self.counters["ranges_overwritten"] += 1
         sent_s = transmission_s(header.tx_second, toa_s)
         self._held.append(
             _HeldRange(
-                vehicle=header.vehicle,
+                chain=chain,
                 sent_s=sent_s,
                 arrived_s=toa_s,
                 range_m=(toa_s - sent_s) * self._settings.sound_speed_mps,
@@ -59,11 +59,11 @@ class Ranging:
         )
 
     def use(
-        self, vehicle: int, track: Track, receiver: int, receiver_track: Track, graph: PoseGraph
+        self, chain: int, track: Track, receiver: int, receiver_track: Track, graph: PoseGraph
     ) -> None:
         """Judge, as one window, the held ranges whose both ends are known; enter the good ones."""
         end_s = float(track.time_s[-1])
-        ready = [r for r in self._held if r.vehicle == vehicle and r.sent_s <= end_s]
+        ready = [r for r in self._held if r.chain == chain and r.sent_s <= end_s]
         if not ready:
             return
         self._held = deque((r for r in self._held if r not in ready), self._held.maxlen)
@@ -72,7 +72,7 @@ class Ranging:
         for held in ready:
             try:
                 here = graph.anchor(receiver, held.arrived_s, receiver_track)
-                there = graph.anchor(vehicle, held.sent_s, track)
+                there = graph.anchor(chain, held.sent_s, track)
                 placed.append(_placed(held, here, there, graph))
             except EstimationError:
                 self.counters["ranges_unplaceable"] += 1

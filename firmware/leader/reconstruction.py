@@ -75,6 +75,21 @@ def reconstruct_packets(
     return Reconstruction(grid=grid, track=track, recovered_points=recovered)
 
 
+def states_of_fragment(fragment: SubmapFragment) -> Array:
+    """Return the states (T, 3) north, east, yaw that a single fragment carries, one a second.
+
+    Raises
+    ------
+    EstimationError
+        When the body holds no track.
+    """
+    try:
+        track, _ = decode_track(fragment.body[PROTECTION_BYTES:], 0.0)
+    except RemoteProtocolError as error:
+        raise EstimationError(str(error)) from error
+    return np.column_stack([track.north_m, track.east_m, track.yaw_rad])
+
+
 def _from_bodies(
     fragments: Mapping[int, SubmapFragment], settings: ReconstructionSettings, near_s: float
 ) -> Reconstruction:

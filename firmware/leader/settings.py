@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from firmware.compression.settings import BinningSettings
 from firmware.leader.closures import ClosureSettings
+from firmware.leader.fleet import FleetSettings
 from firmware.leader.judgement import JudgementSettings
 from firmware.leader.matching import MatchingSettings
 from firmware.leader.pose_graph import GraphSettings
@@ -32,6 +33,13 @@ class LeaderSettings(Settings):
     )
     ranges: RangeSettings = setting(RangeSettings, "", "one-way travel times")
     graph: GraphSettings = setting(GraphSettings, "", "the pose graph")
+    fleet: FleetSettings = setting(FleetSettings, "", "the followers' trajectories")
+    answers: str = setting(
+        "paper",
+        "",
+        "22 bytes; or `extended`, 42 bytes with variances, own position and what to repeat",
+        choices=("paper", "extended"),
+    )
     cell_m: float = setting(
         2.0, "m", "grid of the matching (paper, 6.1)", minimum=0.25, maximum=50.0
     )

@@ -1,10 +1,14 @@
 """The dead-reckoned track of each vehicle, as far as its states are known."""
 
+import math
+
 import numpy as np
 
 from firmware.geometry import Array
 from firmware.submaps import Track
 
+_QUANTISED_M = 3.0  # `lattice` tells positions to within a metre or so
+_NEIGHBOURS_S = 10
 _LONGEST_S = 8 * 86_400  # one state a second; eight days are the clock's header twice over
 
 
@@ -15,7 +19,7 @@ class TrackBuffer:
         self._states: dict[int, tuple[float, float, float, float]] = {}
         self._fresh: list[int] = []
         self._columns: Array = np.empty((0, 4))
-        self.jumps = 0
+        self._newest: int | None = None
         self.overflowed = 0
 
     def __len__(self) -> int:
@@ -31,6 +35,24 @@ class TrackBuffer:
             return
         self._states[quarter] = (time_s, north_m, east_m, yaw_rad)
         self._fresh.append(quarter)
+        self._newest = quarter if self._newest is None else max(quarter, self._newest)
+
+    def is_plausible(
+        self, time_s: float, north_m: float, east_m: float, fastest_mps: float
+    ) -> bool:
+        """Return whether a vehicle so fast can have been there, given the states next in time."""
+        here = round(4.0 * time_s)
+        near = range(1, 4 * _NEIGHBOURS_S + 1)
+        before = next((here - k for k in near if here - k in self._states), self._newest)
+        after = next((here + k for k in near if here + k in self._states), None)
+        for quarter in (before, after):
+            if quarter is None:
+                continue
+            at_s, at_north_m, at_east_m, _ = self._states[quarter]
+            moved_m = math.hypot(north_m - at_north_m, east_m - at_east_m)
+            if moved_m > fastest_mps * abs(time_s - at_s) + _QUANTISED_M:
+                return False
+        return True
 
     def track(self) -> Track:
         """Return all states as arrays; sorted again only when an old one arrived late."""

@@ -1,0 +1,112 @@
+"""What the leader tells its followers: whose turn it is, which state is answered, in which form."""
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from firmware.belief import Belief
+from firmware.leader.atlas import LEADER
+from firmware.leader.fleet import Fleet
+from firmware.leader.pose_graph import PoseGraph
+from protocol.errors import EstimationError
+from protocol.packets import Answer, ExtendedAnswer, Header, Profile
+from protocol.reassembly import Reassembler
+from protocol.timestamps import to_quarters, to_tx_second
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KnownState:
+    """The newest state that is known of a follower, and the packet it came in."""
+
+    chain: int
+    boot_epoch: int
+    submap: int
+    time_s: float
+
+
+class Answers:
+    """One answer a slot; followers take turns, and one that cannot be answered loses its turn."""
+
+    def __init__(self, boot_epoch: int, fleet: Fleet, graph: PoseGraph, *, extended: bool) -> None:
+        self.counters: Counter[str] = Counter()
+        self._boot_epoch, self._extended = boot_epoch, extended
+        self._fleet, self._graph = fleet, graph
+        self._known: dict[int, KnownState] = {}
+        self._last_vehicle = LEADER
+        self._sent = 0
+
+    def note(self, header: Header, chain: int, time_s: float) -> None:
+        """Take notice of a state; only a newer one, or one of a newer boot, is answered."""
+        known = self._known.get(header.vehicle)
+        if known is None or chain > known.chain or time_s > known.time_s:
+            self._known[header.vehicle] = KnownState(
+                chain=chain, boot_epoch=header.boot_epoch, submap=header.submap, time_s=time_s
+            )
+
+    def next_answer(
+        self, own: Belief, reassembler: Reassembler, now_s: float
+    ) -> Answer | ExtendedAnswer | None:
+        """Return the answer of this slot, or None if nobody can be told anything."""
+        vehicles = sorted(self._known, key=lambda v: (v <= self._last_vehicle, v))
+        for vehicle in vehicles:
+            known = self._known[vehicle]
+            try:
+                answer = self._answer(vehicle, known, own, reassembler, now_s)
+            except EstimationError:
+                self.counters["answers_unplaceable"] += 1
+                continue
+            self._last_vehicle = vehicle
+            self._sent = (self._sent + 1) % (1 << 16)
+            self.counters["answers_sent"] += 1
+            return answer
+        return None
+
+    def _answer(
+        self, vehicle: int, known: KnownState, own: Belief, reassembler: Reassembler, now_s: float
+    ) -> Answer | ExtendedAnswer:
+        self._fleet.extend(known.chain)
+        anchor = self._graph.anchor(known.chain, known.time_s, self._fleet.track(known.chain))
+        position_m = self._graph.position(anchor)
+        header = Header(
+            profile=Profile.ANSWER_EXTENDED if self._extended else Profile.ANSWER,
+            vehicle=LEADER,
+            boot_epoch=self._boot_epoch,
+            submap=self._sent,
+            fragment=vehicle,
+            fragment_count=known.boot_epoch,
+            tx_second=to_tx_second(round(now_s)),
+            time_quarters=to_quarters(known.time_s),
+        )
+        if not self._extended:
+            return Answer(
+                header=header,
+                submap=known.submap,
+                north_m=_float32(position_m[0]),
+                east_m=_float32(position_m[1]),
+            )
+        repeat_submap, missing = self._missing(vehicle, known.boot_epoch, reassembler)
+        return ExtendedAnswer(
+            header=header,
+            submap=known.submap,
+            north_m=_float32(position_m[0]),
+            east_m=_float32(position_m[1]),
+            variance_m2=_float32(np.trace(self._graph.covariance([anchor])) / 2),
+            leader_north_m=_float32(own.position_m[0]),
+            leader_east_m=_float32(own.position_m[1]),
+            leader_variance_m2=_float32(np.trace(own.covariance_m2) / 2),
+            repeat_submap=repeat_submap,
+            missing_fragments=missing,
+        )
+
+    def _missing(self, vehicle: int, boot_epoch: int, reassembler: Reassembler) -> tuple[int, int]:
+        """Return the sub-map of this boot that lacks fragments, and the bitmap; zeros for none."""
+        found = reassembler.missing(vehicle)
+        if found is None or found[0][1] != boot_epoch:
+            return 0, 0
+        self.counters["repeats_asked"] += found[1].bit_count()
+        return found[0][2], found[1]
+
+
+def _float32(value: float) -> float:
+    return float(np.float32(value))

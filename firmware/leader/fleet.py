@@ -1,0 +1,216 @@
+"""The followers as the leader knows them: one chain of the graph for each boot of each vehicle.
+
+A vehicle that restarts counts its sub-maps from zero and may begin dead reckoning anew. What was
+known of it stays where it is; the new boot is a chain of its own, tied to the old one by how far
+the vehicle can have come meanwhile. A boot is the header's epoch, unrolled; dead reckoning that
+jumps for good without a restart is taken for a boot of the same epoch.
+"""
+
+from collections import Counter, deque
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware.geometry import Array
+from firmware.leader.atlas import BOOT_EPOCHS, LEADER, chain_of, vehicle_of
+from firmware.leader.pose_graph import PoseGraph
+from firmware.leader.ranging import Ranging
+from firmware.leader.tracks import TrackBuffer
+from firmware.leader.trajectory import Trajectory
+from firmware.submaps import Track
+from protocol.errors import EstimationError
+from protocol.packets import Header, usable_states
+from protocol.settings import Settings, setting
+
+_CONTINUES_M = 3.0  # dead reckoning that goes on lies this near to a straight continuation
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FleetSettings(Settings):
+    """What is believed of another vehicle's trajectory."""
+
+    fastest_mps: float = setting(
+        6.0, "m/s", "survey vehicles make half of it; a faster one has jumped", minimum=0.5
+    )
+    oldest_state_s: float = setting(
+        900.0, "s", "no follower keeps a frame for as long; older is damage", minimum=60.0
+    )
+    jumped_states: int = setting(
+        30, "states", "that agree with each other and not with the track: a new start", minimum=2
+    )
+
+
+@dataclass(slots=True)
+class _Vehicle:
+    """What is known of one follower's present boot."""
+
+    boot: int
+    jumped: deque[tuple[float, float, float]] = field(default_factory=deque)
+
+
+class Fleet:
+    """Tracks and chains of all vehicles; the leader's own track is among them."""
+
+    def __init__(self, graph: PoseGraph, ranging: Ranging, settings: FleetSettings) -> None:
+        self.counters: Counter[str] = Counter()
+        self._graph, self._ranging, self._settings = graph, ranging, settings
+        self._tracks: dict[int, TrackBuffer] = {LEADER: TrackBuffer()}
+        self._followers: dict[int, _Vehicle] = {}
+
+    @property
+    def own(self) -> TrackBuffer:
+        """The leader's own track."""
+        return self._tracks[LEADER]
+
+    def vehicles(self) -> list[int]:
+        """Return the vehicles that have a chain, the leader first."""
+        return list(dict.fromkeys(vehicle_of(chain) for chain in self._graph.vehicles()))
+
+    def boot_of(self, header: Header) -> int:
+        """Return which boot a frame is of; of late frames an earlier one than the newest."""
+        known = self._followers.get(header.vehicle)
+        if known is None:
+            known = self._followers[header.vehicle] = _Vehicle(boot=header.boot_epoch)
+        ahead = (header.boot_epoch - known.boot) % BOOT_EPOCHS
+        if (
+            ahead >= BOOT_EPOCHS // 2
+            and chain_of(header.vehicle, known.boot + ahead - BOOT_EPOCHS) in self._tracks
+        ):
+            return known.boot + ahead - BOOT_EPOCHS
+        if ahead:
+            known.boot += ahead
+            known.jumped.clear()
+            self.counters["restarts"] += 1
+        return known.boot
+
+    def chain(self, header: Header) -> int:
+        """Return the number of the chain that a frame's states belong to."""
+        return chain_of(header.vehicle, self.boot_of(header))
+
+    def receive_states(
+        self, header: Header, first_s: float, states: NDArray[np.floating], now_s: float
+    ) -> float | None:
+        """Keep the states (T, 3), one a second from first_s; return the time of the last kept."""
+        s, last_s = self._settings, None
+        for k in np.flatnonzero(usable_states(states)):
+            time_s = first_s + float(k)
+            north_m, east_m, yaw_rad = (float(value) for value in states[k])
+            if time_s > now_s:
+                self.counters["states_from_the_future"] += 1
+            elif time_s < now_s - s.oldest_state_s:
+                self.counters["states_too_old"] += 1
+            elif self._place(header, time_s, north_m, east_m, yaw_rad):
+                last_s = time_s
+            else:
+                self.counters["states_that_jump"] += 1
+        return last_s
+
+    def extend(self, chain: int) -> None:
+        """Let a chain grow by its known track."""
+        buffer = self._tracks.get(chain)
+        if buffer is None or not len(buffer):
+            return
+        track = buffer.track()
+        if chain not in self._graph.vehicles():
+            self._begin(chain, track)
+        self._graph.extend(chain, track)
+        self._graph.extend(LEADER, self.own.track())
+        self._graph.update()
+
+    def use_ranges(self, chain: int) -> None:
+        """Use the held ranges whose senders' states are known by now."""
+        if chain in self._graph.vehicles():
+            self._ranging.use(chain, self.track(chain), LEADER, self.own.track(), self._graph)
+
+    def track(self, chain: int) -> Track:
+        """Return the raw dead-reckoned track of a chain."""
+        return self._tracks[chain].track()
+
+    def whole_track(self, vehicle: int) -> Track:
+        """Return the tracks of all of a vehicle's boots, one after the other."""
+        parts = [self.track(chain) for chain in self._chains(vehicle)]
+        columns = [np.concatenate(part) for part in zip(*map(_columns, parts), strict=True)]
+        return Track(time_s=columns[0], north_m=columns[1], east_m=columns[2], yaw_rad=columns[3])
+
+    def whole_trajectory(self, vehicle: int) -> Trajectory:
+        """Return the estimate over all of a vehicle's boots."""
+        parts = [self._graph.trajectory(chain) for chain in self._chains(vehicle)]
+        if len(parts) == 1:
+            return parts[0]
+        return Trajectory(
+            time_s=np.concatenate([p.time_s for p in parts]),
+            reckoned_m=np.concatenate([p.reckoned_m for p in parts]),
+            position_m=np.concatenate([p.position_m for p in parts]),
+            bias_mps=np.concatenate([p.bias_mps for p in parts]),
+        )
+
+    def chain_at(self, vehicle: int, time_s: float) -> int:
+        """Return the chain of a vehicle that the time belongs to."""
+        chains = self._chains(vehicle)
+        begun = [c for c in chains if self.track(c).time_s[0] <= time_s]
+        return begun[-1] if begun else chains[0]
+
+    def _chains(self, vehicle: int) -> list[int]:
+        chains = [c for c in self._graph.vehicles() if vehicle_of(c) == vehicle]
+        return sorted(chains, key=lambda chain: float(self.track(chain).time_s[0]))
+
+    def _place(
+        self, header: Header, time_s: float, north_m: float, east_m: float, yaw_rad: float
+    ) -> bool:
+        """Keep a state that its track's neighbours allow; a lasting jump begins a new boot."""
+        chain = self.chain(header)
+        buffer = self._tracks.setdefault(chain, TrackBuffer())
+        if buffer.is_plausible(time_s, north_m, east_m, self._settings.fastest_mps):
+            buffer.add(time_s, north_m, east_m, yaw_rad)
+            return True
+        jumped = self._followers[header.vehicle].jumped
+        if jumped and not 0.0 <= time_s - jumped[-1][0] <= 60.0:
+            jumped.clear()
+        reach_m = self._settings.fastest_mps * (time_s - jumped[-1][0]) + 1.0 if jumped else np.inf
+        if jumped and np.hypot(north_m - jumped[-1][1], east_m - jumped[-1][2]) > reach_m:
+            jumped.clear()
+        jumped.append((time_s, north_m, east_m))
+        if len(jumped) >= self._settings.jumped_states:
+            jumped.clear()
+            self._followers[header.vehicle].boot += BOOT_EPOCHS
+            self.counters["lasting_jumps"] += 1
+        return False
+
+    def _begin(self, chain: int, track: Track) -> None:
+        """Start a chain: a vehicle's first at its deployment, a later one where the last ended."""
+        start_m, time_s = _position(track, 0), float(track.time_s[0])
+        chains = self._chains(vehicle_of(chain))
+        earlier = [c for c in chains if self.track(c).time_s[0] < time_s]
+        if not earlier:
+            self._graph.add_vehicle(chain, time_s, start_m, start_m)
+            return
+        before, old = earlier[-1], self.track(earlier[-1])
+        last_s = min(float(old.time_s[-1]), time_s)
+        gap_s = time_s - last_s
+        trajectory = self._graph.trajectory(before)
+        expected_m = trajectory.correct(last_s, old.position_at(last_s))
+        moved_m, sigma_m = np.zeros(2), self._settings.fastest_mps / 2 * gap_s + 5.0
+        velocity_mps = (old.position_at(last_s) - old.position_at(last_s - 5.0)) / 5.0
+        on_m = start_m - old.position_at(last_s)
+        if np.hypot(*(on_m - velocity_mps * gap_s)) < _CONTINUES_M + 0.2 * np.sqrt(gap_s):
+            moved_m, sigma_m = on_m - trajectory.bias_at(last_s) * gap_s, 1.0 + 0.02 * gap_s
+        self._graph.add_vehicle(
+            chain, time_s, start_m, expected_m + moved_m, start_sigma_m=1e4, like=before
+        )
+        try:
+            ends = (
+                self._graph.anchor(before, last_s, old),
+                self._graph.anchor(chain, time_s, track),
+            )
+            self._graph.add_closure(*ends, moved_m, sigma_m**2 * np.eye(2), active=True)
+        except EstimationError:
+            self.counters["restarts_untied"] += 1
+
+
+def _columns(track: Track) -> tuple[Array, Array, Array, Array]:
+    return track.time_s, track.north_m, track.east_m, track.yaw_rad
+
+
+def _position(track: Track, row: int) -> Array:
+    return np.array([track.north_m[row], track.east_m[row]])

@@ -16,7 +16,7 @@ from host_tools.evaluation import evaluate
 from host_tools.mapping import DepthMap
 from host_tools.mission import Progress, run, simulated_vehicles, water_between
 from host_tools.processes.fleet import Fleet, OnWait
-from host_tools.processes.records import VehicleFiles
+from host_tools.processes.records import FOLDER, VehicleFiles
 from host_tools.processes.remote_node import RemoteNode
 from host_tools.processes.voyage import Voyage, add_voyage_arguments, voyage_of
 from host_tools.report import write_report
@@ -142,7 +142,17 @@ def finish(result: MissionResult, out: Path, *, report: bool = True) -> list[str
     write_outputs(result, evaluation, out)
     if report:
         write_report(result, evaluation, out / "report.html")
-    return outcome_lines(evaluation)
+    return [*outcome_lines(evaluation), *failure_lines(result, out)]
+
+
+def failure_lines(result: MissionResult, out: Path) -> list[str]:
+    """Return a line for every vehicle in whose loop something went wrong."""
+    return [
+        f"{owner}: {name} {count:g} times; see {out / FOLDER / owner}.log"
+        for owner, counters in result.counters.items()
+        for name, count in counters.items()
+        if name.endswith("_failed")
+    ]
 
 
 class WaitNotice:

@@ -16,7 +16,7 @@ from firmware.clock import WallClock
 from firmware.dead_reckoning import DeadReckoning, ReckonedState
 from firmware.follower.core import FollowerCore
 from firmware.follower.loop import FollowerLoop
-from firmware.leader.core import LEADER, LeaderCore
+from firmware.leader.core import LeaderCore
 from firmware.leader.loop import LeaderLoop
 from firmware.leader.worker import InlineWorker, ThreadWorker, Worker
 from firmware.ports import SensorStep
@@ -33,6 +33,7 @@ from protocol.modems.base import Modem
 from protocol.modems.registry import open_modem
 from protocol.schedule import Slots
 
+LEADER = 0
 BOOT_EPOCHS = 16
 STATUS_S = 60.0
 WALL = "wall"

@@ -1,0 +1,121 @@
+"""The commands themselves: real processes, real ports, and what they say when something is off."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from host_tools.cli import main
+from host_tools.processes.demo import Crew
+from host_tools.processes.vehicle import start_time_s
+from protocol.errors import ConfigError
+
+SHORT = ["--seed", "5", "--set", "duration_min=2.5", "--set", "beams=32"]
+SHORT += ["--set", "follower_duration_min=2"]
+
+
+def fathomlink(*arguments: str) -> list[str]:
+    return [sys.executable, "-m", "host_tools.cli", *arguments, *SHORT]
+
+
+def alike(one: Path, other: Path, names: list[str]) -> bool:
+    return all((one / name).read_bytes() == (other / name).read_bytes() for name in names)
+
+
+def test_two_processes_write_the_same_files_as_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["demo", "--out", str(tmp_path / "two"), *SHORT]) == 0
+    said = capsys.readouterr()
+    assert "report.html" in said.out
+    assert "dead reckoning" in said.out
+    assert said.err == ""
+    assert "_failed" not in said.out
+    assert (tmp_path / "two" / "report.html").is_file()
+    assert main(["simulate", "--no-report", "--out", str(tmp_path / "one"), *SHORT]) == 0
+    names = ["air.jsonl", "closures.csv", "leader_final.tum", "follower_1_live.tum", "map.tif"]
+    assert alike(tmp_path / "one", tmp_path / "two", names)
+    assert (tmp_path / "one" / "air.jsonl").read_bytes().count(b"\n") > 20
+
+
+def test_a_dying_process_ends_the_demo_with_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    start = Crew.start
+
+    def start_badly(crew: Crew, name: str, arguments: list[str], log: Path) -> None:
+        more = ["--vehicle", "9"] if name != "leader" else []
+        start(crew, name, [*arguments, *more], log)
+
+    monkeypatch.setattr(Crew, "start", start_badly)
+    assert main(["demo", "--out", str(tmp_path), *SHORT]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "follower_1 ended with status 2: fathomlink: --vehicle is 9" in error
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["follower", "--modem", "serial:///dev/nowhere"], "/dev/nowhere is not there; plug"),
+        (["follower", "--modem", "loopback://"], "two processes need serial://"),
+        (["leader", "--modem", "/dev/ttyUSB0"], "is no URL; write e.g."),
+        (["leader", "--modem", "serial:///dev/ptmx", "--clock", "sundial"], "give wall, or the"),
+        (["follower", "--vehicle", "2", "--modem", "x"], "this scenario's followers are 1 to 1"),
+        (["leader", "--modem", "serial:///dev/ptmx", "--start", "noon"], "such as 2026-05-01T12"),
+        (["channel", "--ports", "/dev/null"], "give --ports a short path"),
+    ],
+)
+def test_what_is_wrong_with_a_port_or_a_clock_is_one_line(
+    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*arguments, "--out", str(tmp_path), *SHORT]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_a_start_is_a_whole_second_of_utc() -> None:
+    assert start_time_s("1970-01-02T00:00:00Z") == 86_400.0
+    assert start_time_s("1970-01-01T12:00:00") == 43_200.0
+    assert start_time_s("next") % 60.0 == 0.0
+    with pytest.raises(ConfigError, match="whole second"):
+        start_time_s("1970-01-01T00:00:00.5Z")
+
+
+@pytest.mark.slow
+def test_a_follower_killed_in_mid_mission_is_waited_for_and_the_mission_goes_on(
+    tmp_path: Path,
+) -> None:
+    out, clock = tmp_path / "out", f"unix://{tmp_path / 'p' / 'clock'}"
+    channel = subprocess.Popen(
+        fathomlink("channel", "--no-report", "--ports", str(tmp_path / "p"), "--out", str(out)),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+    def vehicle(*name: str) -> "subprocess.Popen[bytes]":
+        port = tmp_path / "p" / ("leader" if name == ("leader",) else "follower-1")
+        return subprocess.Popen(
+            fathomlink(*name, "--modem", f"serial://{port}", "--clock", clock, "--out", str(out))
+        )
+
+    while not (tmp_path / "p" / "follower-1").exists():
+        time.sleep(0.05)
+    leader, follower = vehicle("leader"), vehicle("follower")
+    beliefs = out / "processes" / "follower_1.beliefs"
+    while not (beliefs.exists() and beliefs.stat().st_size > 50 * 80):
+        time.sleep(0.001)
+    os.kill(follower.pid, signal.SIGKILL)
+    follower.wait()
+    follower = vehicle("follower")
+    said, errors = channel.communicate(timeout=120)
+    assert (leader.wait(), follower.wait(), channel.returncode) == (0, 0, 0)
+    assert "waiting for follower_1" in errors
+    assert "follower_1" in said
+    assert beliefs.stat().st_size >= 151 * 80

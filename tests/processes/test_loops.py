@@ -1,0 +1,186 @@
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from firmware.clock import WallClock
+from firmware.executive import Executive, Task
+from firmware.follower.core import FollowerCore
+from firmware.follower.loop import FollowerLoop
+from firmware.follower.settings import FollowerSettings
+from firmware.leader.worker import ThreadWorker
+from firmware.ports import ModemPort, SensorPort, SensorStep
+from firmware.soundings import Odometry, Ping
+from host_tools.mission import deployed
+from host_tools.nodes import FollowerNode
+from host_tools.scenario import named_scenario
+from host_tools.simulator.placement import place_survey
+from host_tools.simulator.terrain import open_terrain
+from host_tools.simulator.vehicle import SimulatedVehicle
+from protocol.acoustics import Delivery, Water, WaterSettings
+from protocol.modems.base import ModemStatus
+from protocol.modems.loopback import LoopbackMedium, LoopbackModem
+from protocol.schedule import Slots, SlotSettings
+from protocol.settings import replace
+
+
+def odometry(time_s: float) -> Odometry:
+    return Odometry(
+        time_s=time_s,
+        velocity_north_mps=1.0,
+        velocity_east_mps=0.0,
+        yaw_rad=0.0,
+        depth_m=10.0,
+    )
+
+
+class Notebook:
+    def __init__(self) -> None:
+        self.times_s: list[float] = []
+
+    def receive_odometry(self, odometry: Odometry) -> None:
+        self.times_s.append(odometry.time_s)
+
+    def receive_ping(self, ping: Ping) -> None:
+        raise AssertionError(f"there is no {ping}")
+
+
+def loopback() -> tuple[list[Delivery], LoopbackModem]:
+    water = Water(
+        WaterSettings(loss=0.0), np.random.default_rng(1), lambda node, _: (100.0 * node, 0.0, 0.0)
+    )
+    deliveries: list[Delivery] = []
+    return deliveries, LoopbackMedium(water, deliveries.append).modem(1)
+
+
+def test_sensors_are_fed_up_to_now_and_no_further() -> None:
+    steps: Iterator[SensorStep] = ((odometry(k * 0.25), None) for k in range(9))
+    port, core = SensorPort(steps), Notebook()
+    port.feed(core, 0.5)
+    assert core.times_s == [0.0, 0.25, 0.5]
+    port.feed(core, 0.6)
+    assert core.times_s == [0.0, 0.25, 0.5]
+    port.feed(core, 99.0)
+    port.feed(core, 100.0)
+    assert core.times_s == [k * 0.25 for k in range(9)]
+
+
+def test_what_goes_wrong_in_one_task_does_not_stop_the_others(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    ran: list[str] = []
+
+    def fail(now_s: float) -> None:
+        raise ValueError(f"at {now_s}")
+
+    executive = Executive(
+        (
+            Task(name="bad", period_s=1.0, deadline_s=1.0, work=fail),
+            Task(name="good", period_s=1.0, deadline_s=1.0, work=lambda _: ran.append("good")),
+        ),
+        lambda: 0.0,
+    )
+    executive.step(0.0)
+    assert ran == ["good"]
+    assert executive.counters == {"bad_failed": 1}
+    assert "bad failed at 0.000 s" in caplog.text
+
+
+def test_tasks_keep_their_periods_and_late_ones_are_counted() -> None:
+    ran: list[float] = []
+    clock = iter([0.0, 0.1, 10.0, 10.5, 20.0, 20.1])
+    executive = Executive(
+        (Task(name="slow", period_s=1.0, deadline_s=0.2, work=ran.append),), lambda: next(clock)
+    )
+    for now_s in (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0):
+        executive.step(now_s)
+    assert ran == [0.0, 1.0, 2.0]
+    assert executive.counters == {"slow_overran": 1}
+
+
+def test_a_core_is_not_asked_for_frames_while_its_port_is_away() -> None:
+    _, modem = loopback()
+    asked: list[float] = []
+    port = ModemPort(modem)
+    up = ModemStatus(is_up=False)
+    modem.status = lambda: up  # type: ignore[method-assign]
+    port.speak(asked.append, now_s=1.0)
+    assert asked == []
+    up = ModemStatus(is_up=True)
+    port.speak(asked.append, now_s=2.0)
+    assert asked == [2.0]
+
+
+def test_the_loop_says_what_the_simulators_node_says() -> None:
+    scenario = replace(named_scenario("paper-1"), {"duration_min": 1.2, "beams": 24})
+    site = place_survey(open_terrain(None), scenario, 1)
+    vehicles = [SimulatedVehicle(scenario, site.seabed, 1, 1) for _ in range(2)]
+    cores = [
+        FollowerCore(
+            1, 0, deployed(vehicle), settings=FollowerSettings(), slots=Slots(SlotSettings())
+        )
+        for vehicle in vehicles
+    ]
+    node = FollowerNode(cores[0], vehicles[0].steps())
+    deliveries, modem = loopback()
+    loop = FollowerLoop(cores[1], modem, vehicles[1].steps(), lambda: 0.0)
+    expected = []
+    for step in range(289):
+        now_s = step * 0.25
+        frame = node.tick(now_s)
+        expected += [] if frame is None else [frame]
+        loop.step(now_s)
+    modem.poll(1e9)
+    assert expected
+    assert [delivery.frame for delivery in deliveries] == expected
+    assert loop.status()["modem_sent"] == len(expected)
+    assert not [name for name in loop.status() if name.endswith(("failed", "overran"))]
+
+
+class Batch:
+    sheet = type("Sheet", (), {"id": 7})
+
+    def __init__(self, outcome: object) -> None:
+        self.outcome = outcome
+
+    def run(self) -> list[object]:
+        if isinstance(self.outcome, Exception):
+            raise self.outcome
+        return [self.outcome]
+
+
+def test_the_worker_takes_one_batch_at_a_time_and_survives_a_bad_one(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    worker = ThreadWorker()
+    for outcome in ("a", ValueError("bad"), "b"):
+        batch = Batch(outcome)
+        assert worker.is_free
+        worker.give(batch)  # type: ignore[arg-type]
+        assert not worker.is_free
+        while not worker.is_free:
+            finished = worker.take()
+            if finished is not None:
+                assert finished.outcomes == [outcome]
+    assert worker.failed == 1
+    assert "the matches of 7 failed" in caplog.text
+    worker.close()
+
+
+def test_the_wall_clock_leaves_out_the_ticks_that_a_busy_loop_missed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    wall = {"s": 1000.0}
+    monkeypatch.setattr("firmware.clock.time.clock_gettime", lambda _: wall["s"])
+
+    def sleep(wait_s: float) -> None:
+        wall["s"] += wait_s
+
+    monkeypatch.setattr("firmware.clock.time.sleep", sleep)
+    clock = WallClock(start_utc_s=1000.25, end_s=2.0)
+    seen = []
+    for now_s in clock.ticks(0.25):
+        seen.append(now_s)
+        wall["s"] += 0.8 if now_s == 0.5 else 0.01
+    assert seen == [0.0, 0.25, 0.5, 1.5, 1.75, 2.0]
+    assert clock.skipped == 3

@@ -4,12 +4,12 @@ The same frames travel, with the same losses and delays; a baseline changes only
 makes of a transfer. The originals come from a second sub-map builder beside each follower.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from firmware.dead_reckoning import DeadReckoning
 from firmware.follower.core import FollowerCore
 from firmware.follower.settings import FollowerSettings
+from firmware.leader.core import Rebuild
 from firmware.leader.own_grid import grid_of
 from firmware.leader.reconstruction import Reconstruction
 from firmware.soundings import Odometry, Ping
@@ -17,10 +17,9 @@ from firmware.submap_builder import SubmapBuilder
 from firmware.submaps import Submap
 from host_tools.nodes import Steps
 from host_tools.octree import decode_octree, octree_submap
-from protocol.errors import EstimationError
+from protocol.errors import ConfigError, EstimationError
 from protocol.reassembly import SubmapTransfer
 
-Rebuild = Callable[[SubmapTransfer], Reconstruction]
 Key = tuple[int, int, int]
 MOST_CHUNKS = 10  # a sub-map's share of the air
 
@@ -82,7 +81,9 @@ def unlimited(originals: Originals, cell_m: float) -> Rebuild:
 
     def rebuild(transfer: SubmapTransfer) -> Reconstruction:
         submap = originals.of(transfer)
-        return Reconstruction(grid=grid_of(submap.bins, cell_m), track=submap.track)
+        return Reconstruction(
+            grid=grid_of(submap.bins, cell_m), track=submap.track, is_original=True
+        )
 
     return rebuild
 
@@ -105,3 +106,21 @@ def octree(originals: Originals) -> Rebuild:
         return Reconstruction(grid=decode_octree(chunks, submap.track), track=submap.track)
 
     return rebuild
+
+
+def rebuild_of(baseline: str, originals: Originals, cell_m: float) -> Rebuild | None:
+    """Return the leader's way to rebuild under a baseline, None for its own.
+
+    Raises
+    ------
+    ConfigError
+        For an unknown baseline.
+    """
+    match baseline:
+        case "none":
+            return None
+        case "unlimited":
+            return unlimited(originals, cell_m)
+        case "octree":
+            return octree(originals)
+    raise ConfigError(f"no baseline {baseline!r}; known are none, unlimited and octree")

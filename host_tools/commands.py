@@ -10,7 +10,7 @@ from host_tools.scenario import load_scenario
 from protocol.errors import ConfigError
 
 PROFILES = ("paper", "dense", "lattice")
-BASELINES = ("none",)
+BASELINES = ("none", "unlimited", "octree")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

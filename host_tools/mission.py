@@ -8,6 +8,7 @@ import numpy as np
 from firmware.dead_reckoning import ReckonedState
 from firmware.follower.core import FollowerCore
 from firmware.leader.core import LeaderCore
+from host_tools.baselines import Originals, copied_steps, rebuild_of
 from host_tools.mission_settings import MissionSettings
 from host_tools.nodes import FollowerNode, LeaderNode, Node
 from host_tools.simulator.placement import Site
@@ -44,24 +45,25 @@ def water_between(settings: MissionSettings, vehicles: list[SimulatedVehicle], s
 
 
 def local_nodes(
-    settings: MissionSettings, vehicles: list[SimulatedVehicle]
+    settings: MissionSettings, vehicles: list[SimulatedVehicle], baseline: str = "none"
 ) -> tuple[LeaderNode, list[FollowerNode]]:
     """Return every vehicle with its core, in this process."""
     slots = Slots(settings.slots)
-    leader = LeaderNode(
-        LeaderCore(0, deployed(vehicles[0]), settings=settings.leader, slots=slots),
-        vehicles[0].steps(),
+    originals = Originals(submaps={})
+    rebuild = rebuild_of(baseline, originals, settings.leader.cell_m)
+    leader = LeaderCore(
+        0, deployed(vehicles[0]), settings=settings.leader, slots=slots, rebuild=rebuild
     )
-    followers = [
-        FollowerNode(
-            FollowerCore(
-                vehicle.index, 0, deployed(vehicle), settings=settings.follower, slots=slots
-            ),
-            vehicle.steps(),
+    followers = []
+    for vehicle in vehicles[1:]:
+        core = FollowerCore(
+            vehicle.index, 0, deployed(vehicle), settings=settings.follower, slots=slots
         )
-        for vehicle in vehicles[1:]
-    ]
-    return leader, followers
+        steps = vehicle.steps()
+        if rebuild is not None:
+            steps = copied_steps(steps, core, settings.follower, originals)
+        followers.append(FollowerNode(core, steps))
+    return LeaderNode(leader, vehicles[0].steps()), followers
 
 
 def deployed(vehicle: SimulatedVehicle) -> ReckonedState:

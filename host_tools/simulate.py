@@ -33,7 +33,7 @@ def simulate(
     site = place_survey(open_terrain(terrain, scenario.relief_seed), scenario, seed)
     truth_map = DepthMap(site.window)
     vehicles = simulated_vehicles(settings, site, seed, truth_map.add)
-    leader, followers = local_nodes(settings, vehicles)
+    leader, followers = local_nodes(settings, vehicles, baseline)
     deliveries: list[Delivery] = []
     run(
         {0: leader, **{node.core.vehicle: node for node in followers}},

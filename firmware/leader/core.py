@@ -7,6 +7,7 @@ closures -> gate -> consistency -> ledger -> update -> answer.
 import dataclasses
 import math
 from collections import Counter, deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +24,11 @@ from firmware.leader.matching import MatchOutcome
 from firmware.leader.own_grid import grid_of
 from firmware.leader.pose_graph import PoseGraph
 from firmware.leader.ranging import Ranging
-from firmware.leader.reconstruction import reconstruct_packets, states_of_fragment
+from firmware.leader.reconstruction import (
+    Reconstruction,
+    reconstruct_packets,
+    states_of_fragment,
+)
 from firmware.leader.settings import LeaderSettings
 from firmware.leader.trajectory import Trajectory
 from firmware.soundings import Odometry, Ping
@@ -43,6 +48,8 @@ from protocol.timestamps import from_quarters
 
 _OFF_TRACK_M = 5.0  # a sub-map's own states are those of the track, to the wire's quantisation
 _RANGE_WINDOW_S = 20.0  # five frames: enough to tell true ranges from stretched ones together
+Rebuild = Callable[[SubmapTransfer], Reconstruction]
+"""How a sub-map is made of what arrived of it; raises EstimationError when it cannot be."""
 _SUPERFRAME_S = 60.0  # a slot that lies farther ahead was computed before the clock was set back
 
 
@@ -62,9 +69,16 @@ class LeaderCore:
     """The leader, as a function of what it is given and when."""
 
     def __init__(
-        self, boot_epoch: int, start: ReckonedState, *, settings: LeaderSettings, slots: Slots
+        self,
+        boot_epoch: int,
+        start: ReckonedState,
+        *,
+        settings: LeaderSettings,
+        slots: Slots,
+        rebuild: Rebuild | None = None,
     ) -> None:
         self.boot_epoch = boot_epoch
+        self._rebuild = self._reconstruct if rebuild is None else rebuild
         self.counters: Counter[str] = Counter()
         self.closures: list[Closure] = []
         self.graph = PoseGraph(settings.graph)
@@ -266,9 +280,7 @@ class LeaderCore:
         sheet_id = SheetId(vehicle=header.vehicle, boot_epoch=boot, submap=header.submap)
         self._use_ranges(sheet_id.chain)
         try:
-            rebuilt = reconstruct_packets(
-                transfer.fragments, self._settings.reconstruction, transfer.first_arrival_s
-            )
+            rebuilt = self._rebuild(transfer)
         except EstimationError:
             self.counters["submaps_not_rebuilt"] += 1
             return
@@ -277,7 +289,13 @@ class LeaderCore:
         elif not self._is_on_track(sheet_id.chain, rebuilt.track):
             self.counters["submaps_off_track"] += 1
         else:
-            self._add_sheet(sheet_of(sheet_id, rebuilt.track, rebuilt.grid, reconstructed=True))
+            lossy = not rebuilt.is_original
+            self._add_sheet(sheet_of(sheet_id, rebuilt.track, rebuilt.grid, reconstructed=lossy))
+
+    def _reconstruct(self, transfer: SubmapTransfer) -> Reconstruction:
+        return reconstruct_packets(
+            transfer.fragments, self._settings.reconstruction, transfer.first_arrival_s
+        )
 
     def _is_on_track(self, chain: int, track: Track) -> bool:
         """Return whether a sub-map was measured where its chain was, so that it can be placed."""

@@ -47,6 +47,7 @@ class Reconstruction:
     grid: GriddedSubmap
     track: Track
     recovered_points: int = 0
+    is_original: bool = False  # the soundings themselves, not what a decoder made of points
 
 
 def reconstruct_packets(

@@ -75,9 +75,8 @@ class FollowerNode:
         self.core, self._steps, self.log = core, steps, BeliefLog()
 
     def hear(self, frame: bytes, toa_s: float | None, now_s: float) -> None:
-        """Take a frame; a follower has no use for the time of arrival."""
-        del toa_s
-        self.core.receive_frame(frame, now_s)
+        """Take a frame and the arrival of its first bit."""
+        self.core.receive_frame(frame, toa_s, now_s)
 
     def tick(self, now_s: float) -> bytes | None:
         """Feed one step of the sensors, do a slice of work, and ask for a frame."""

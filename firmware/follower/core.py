@@ -9,21 +9,29 @@ import numpy as np
 
 from firmware.belief import Belief
 from firmware.compression import Compressed, compress_steps, packets_from
-from firmware.follower.settings import FollowerSettings
+from firmware.compression.settings import CompressionSettings
 from firmware.dead_reckoning import DeadReckoning, ReckonedState
 from firmware.follower.correction import DriftCorrection
+from firmware.follower.outbox import Outbox
+from firmware.follower.settings import FollowerSettings
 from firmware.geometry import Array
 from firmware.soundings import Odometry, Ping
 from firmware.submap_builder import SubmapBuilder, track_of
-from firmware.submaps import Submap
+from firmware.submaps import Submap, Track
 from protocol.codec import decode, encode
-from protocol.errors import ConfigError, EstimationError, RemoteProtocolError
-from protocol.packets import Answer, Header, Packet, Profile, TrajectoryPacket
+from protocol.errors import (
+    ConfigError,
+    EstimationError,
+    LocalProtocolError,
+    RemoteProtocolError,
+)
+from protocol.packets import Answer, ExtendedAnswer, Header, Profile
 from protocol.schedule import Slots
-from protocol.timestamps import from_quarters, to_quarters, to_tx_second
+from protocol.timestamps import from_quarters, to_quarters, transmission_s
 
-_STATES_PER_TRAJECTORY_PACKET = 20
-_QUEUED_PACKETS = 30  # three sub-maps: what cannot leave within two minutes is too old to matter
+_IDLE_STATES = 20  # as many as a trajectory packet holds
+_LONGEST_AIRTIME_S = 5.0
+_SUPERFRAME_S = 60.0  # a slot that lies farther ahead was computed before the clock was set back
 
 
 @dataclass(slots=True)
@@ -63,9 +71,11 @@ class FollowerCore:
         )
         self._track: deque[ReckonedState] = deque(maxlen=int(settings.track_s))
         self._fit: _Fit | None = None
-        self._outbox: deque[Packet] = deque(maxlen=_QUEUED_PACKETS)
+        self._compression = _fitting(settings, slots)
+        self._outbox = Outbox(
+            vehicle, boot_epoch, settings.repeats, small_frames=self._compression.small_frames
+        )
         self._next_slot_s = slots.next_slot_s(vehicle, start.time_s)
-        self._trajectory_packets = 0
         self._last_submap_s = start.time_s
 
     def receive_odometry(self, odometry: Odometry) -> None:
@@ -82,17 +92,22 @@ class FollowerCore:
         """Add the soundings of a ping to the sub-map being measured."""
         self._builder.receive_ping(ping, self._reckoning.state)
 
-    def receive_frame(self, frame: bytes, now_s: float) -> None:
-        """Take a frame from the water; whatever is no answer to this vehicle is counted."""
+    def receive_frame(self, frame: bytes, toa_s: float | None, now_s: float) -> None:
+        """Take a frame and, where the modem vouches for it, the arrival of its first bit."""
         try:
             packet = decode(frame)
         except RemoteProtocolError:
             self.counters["frames_rejected"] += 1
             return
-        if isinstance(packet, Answer):
-            self._receive_answer(packet, now_s)
-        else:
+        if not isinstance(packet, Answer | ExtendedAnswer) or packet.header.vehicle != 0:
             self.counters["frames_not_for_us"] += 1
+            return
+        if isinstance(packet, ExtendedAnswer) and toa_s is not None:
+            self._receive_range(packet, toa_s, now_s)
+        if packet.to_vehicle != self.vehicle or packet.to_boot_epoch != self.boot_epoch:
+            self.counters["answers_to_others"] += 1
+            return
+        self._receive_answer(packet, now_s)
 
     def tick(self, now_s: float) -> None:
         """Do one slice of the fit; queue its packets when it is done or its first slot is due."""
@@ -108,7 +123,7 @@ class FollowerCore:
 
     def poll(self, now_s: float) -> bytes | None:
         """Return the frame to transmit now, or None; one a slot, on a whole second."""
-        if now_s < self._next_slot_s - 1e-6:
+        if self._next_slot_s - _SUPERFRAME_S < now_s < self._next_slot_s - 1e-6:
             return None
         slot_s = self._slots.next_slot_s(self.vehicle, now_s)
         on_time = abs(slot_s - now_s) < 1e-6
@@ -116,12 +131,11 @@ class FollowerCore:
         if not on_time:
             self.counters["slots_missed"] += 1
             return None
-        packet = self._outbox.popleft() if self._outbox else self._trajectory_packet()
+        packet = self._outbox.next_packet(slot_s, self._slots_left(slot_s), self._idle_states())
         if packet is None:
             return None
-        header = dataclasses.replace(packet.header, tx_second=to_tx_second(round(now_s)))
         self.counters["frames_sent"] += 1
-        return encode(dataclasses.replace(packet, header=header))
+        return encode(packet)
 
     def belief(self) -> Belief:
         """Return where this vehicle believes itself to be, by dead reckoning and answers."""
@@ -138,6 +152,7 @@ class FollowerCore:
         """Return every counter: what was sent, used, rejected and dropped."""
         return {
             **self.counters,
+            **self._outbox.status(),
             "bad_odometry": self._reckoning.bad_samples,
             "bad_beams": self._builder.bad_beams,
             "bad_pings": self._builder.bad_pings,
@@ -145,6 +160,8 @@ class FollowerCore:
             "answers_gated": self._correction.gated,
             "answers_stale": self._correction.stale,
             "answers_restarted_us": self._correction.restarted,
+            "ranges_used": self._correction.ranges_accepted,
+            "ranges_gated": self._correction.ranges_gated,
         }
 
     def _begin_fit(self, submap: Submap) -> None:
@@ -156,7 +173,7 @@ class FollowerCore:
             return
         self._last_submap_s = float(submap.track.time_s[-1])
         try:
-            steps = compress_steps(submap.bins, self._settings.compression)
+            steps = compress_steps(submap.bins, self._compression, self._settings.profile)
         except EstimationError:
             self.counters["submaps_unfit"] += 1
             return
@@ -179,49 +196,65 @@ class FollowerCore:
             tx_second=0,
             time_quarters=to_quarters(float(fit.submap.track.time_s[0])),
         )
-        packets = packets_from(fit.best, fit.submap.track, header)
-        self.counters["packets_overwritten"] += max(
-            0, len(self._outbox) + len(packets) - _QUEUED_PACKETS
-        )
-        self._outbox.extend(packets)
-        self.counters["submaps_sent"] += 1
-
-    def _trajectory_packet(self) -> TrajectoryPacket | None:
-        """Return the newest states alone, once there has been no sub-map for its whole duration."""
-        now_s = self._reckoning.state.time_s
-        idle_s = now_s - self._last_submap_s
-        if self._fit is not None or idle_s < 2 * self._settings.submaps.duration_s:
-            return None
-        states = list(self._track)[-_STATES_PER_TRAJECTORY_PACKET:]
-        track = track_of(states)
-        rows = np.full((_STATES_PER_TRAJECTORY_PACKET, 3), np.nan, dtype=np.float32)
-        offsets = np.round(track.time_s - track.time_s[0]).astype(int)
-        kept = offsets < _STATES_PER_TRAJECTORY_PACKET
-        rows[offsets[kept]] = np.column_stack([track.north_m, track.east_m, track.yaw_rad])[kept]
-        self._trajectory_packets = (self._trajectory_packets + 1) % (1 << 16)
-        header = Header(
-            profile=Profile.TRAJECTORY,
-            vehicle=self.vehicle,
-            boot_epoch=self.boot_epoch,
-            submap=self._trajectory_packets,
-            fragment=0,
-            fragment_count=1,
-            tx_second=0,
-            time_quarters=to_quarters(float(track.time_s[0])),
-        )
-        return TrajectoryPacket(header=header, states=rows)
-
-    def _receive_answer(self, answer: Answer, now_s: float) -> None:
-        if answer.to_vehicle != self.vehicle or answer.to_boot_epoch != self.boot_epoch:
-            self.counters["frames_not_for_us"] += 1
+        try:
+            packets = packets_from(fit.best, fit.submap.track, header)
+        except LocalProtocolError:
+            self.counters["submaps_unfit"] += 1
             return
+        self._outbox.add(packets)
+
+    def _slots_left(self, slot_s: float) -> int:
+        """Return how many slots are left, with this one, before the next sub-map is due."""
+        duration_s = self._settings.submaps.duration_s
+        due_s = duration_s * (np.floor(slot_s / duration_s + 1e-9) + 1)
+        period_s = self._slots.next_slot_s(self.vehicle, slot_s + 1e-3) - slot_s
+        return max(1, int(np.ceil((due_s - slot_s) / period_s - 1e-9)))
+
+    def _idle_states(self) -> list[ReckonedState]:
+        """Return the newest states, once there has been no sub-map for its whole duration."""
+        idle_s = self._reckoning.state.time_s - self._last_submap_s
+        if self._fit is not None or idle_s < 2 * self._settings.submaps.duration_s:
+            return []
+        return list(self._track)[-_IDLE_STATES:]
+
+    def _receive_range(self, answer: ExtendedAnswer, toa_s: float, now_s: float) -> None:
+        """Range-aid: the answer says where the leader was, its way how far that is from here."""
+        sent_s = transmission_s(answer.header.tx_second, toa_s)
+        range_m = (toa_s - sent_s) * self._settings.correction.sound_speed_mps
+        if not abs(now_s - toa_s) <= _LONGEST_AIRTIME_S:
+            self.counters["ranges_unplaceable"] += 1
+            return
+        self._correction.receive_range(
+            toa_s,
+            self._known_track().position_at(toa_s),
+            np.array([answer.leader_north_m, answer.leader_east_m]),
+            float(np.sqrt(answer.leader_variance_m2)) if answer.leader_variance_m2 > 0 else np.nan,
+            range_m,
+        )
+
+    def _receive_answer(self, answer: Answer | ExtendedAnswer, now_s: float) -> None:
+        """Learn from the leader's estimate of a past state; queue what it asks for."""
+        sigma_m = None
+        if isinstance(answer, ExtendedAnswer):
+            self._outbox.request(answer.repeat_submap, answer.missing_fragments, now_s)
+            sigma_m = float(np.sqrt(answer.variance_m2)) if answer.variance_m2 > 0 else np.nan
         time_s = from_quarters(answer.header.time_quarters, now_s)
-        track = track_of(list(self._track))
-        if not track.time_s.size or not track.time_s[0] <= time_s <= now_s:
+        track = self._known_track()
+        if not track.time_s[0] <= time_s <= now_s:
             self.counters["answers_unplaceable"] += 1
             return
         answered_m = np.array([answer.north_m, answer.east_m])
-        self._correction.receive_answer(time_s, track.position_at(time_s), answered_m)
+        self._correction.receive_answer(time_s, track.position_at(time_s), answered_m, sigma_m)
+
+    def _known_track(self) -> Track:
+        return track_of([*self._track, self._reckoning.state])
+
+
+def _fitting(settings: FollowerSettings, slots: Slots) -> CompressionSettings:
+    """Return the compression's settings with as many frames as the air has for a sub-map."""
+    room = max(1, min(slots.frames_per_submap(settings.submaps.duration_s), 15))
+    frames = settings.frames_per_submap or min(settings.compression.frames, room)
+    return dataclasses.replace(settings.compression, frames=frames)
 
 
 def _position(state: ReckonedState) -> Array:

@@ -1,135 +1,195 @@
 """What the leader's answers teach a follower about its own dead reckoning.
 
-The state is how far dead reckoning has run away, and how fast: (c_n, c_e, b_n, b_e). It is kept
-at the time of the last state that an answer spoke of, because an answer is one to two minutes old;
-from there it is carried to any later time by the drift. Dead reckoning itself is never corrected.
+The state is how far dead reckoning has run away and how fast, beside the errors of the leader's
+own estimates. An answer is one to two minutes old and the leader repeats and revises it: its error
+is not drawn anew each time, but wanders. It is therefore kept as a state of its own, in units of
+the answer's sigma, so that many answers do not count as much evidence. What came is kept in the
+order of its times and filtered again whenever something older arrives. Nothing here corrects dead
+reckoning itself.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
+from firmware.follower.drift_filter import (
+    AnswerSeen,
+    DriftFilter,
+    DriftSettings,
+    DriftState,
+    RangeSeen,
+)
 from firmware.geometry import Array
-from protocol.settings import Settings, setting
+from protocol.settings import setting
 
-_CHI_SQUARE_2_999 = 13.8  # 99.9 % of a true innovation of two components lies below
+_CHI_SQUARE_1_99, _CHI_SQUARE_2_999 = 6.6, 13.8  # shares of true innovations that lie below
+_KEPT = 96  # answers and ranges of eight minutes; older ones are in the filter's beginning
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CorrectionSettings(Settings):
-    """What a follower believes of its dead reckoning and of answers."""
+class CorrectionSettings(DriftSettings):
+    """What a follower believes of its dead reckoning, of answers and of ranges."""
 
-    start_sigma_m: float = setting(0.5, "m", "uncertainty of the start", minimum=1e-3)
-    odometry_noise: float = setting(0.2, "m/sqrt(s)", "random part of dead reckoning", minimum=1e-4)
-    bias_sigma_mps: float = setting(0.15, "m/s", "unmeasured current at the start", minimum=1e-4)
-    bias_walk: float = setting(0.002, "m/s/sqrt(s)", "how the current wanders", minimum=1e-7)
     answer_sigma_m: float = setting(3.0, "m", "error of an answer that tells none", minimum=0.01)
+    echo_sigma_m: float = setting(
+        4.0, "m", "an answer this near to dead reckoning may be no more than its echo", minimum=0.01
+    )
+    sound_speed_mps: float = setting(
+        1500.0, "m/s", "mean over the path", minimum=1300.0, maximum=1700.0
+    )
+    shortest_range_m: float = setting(20.0, "m", "nearer, the direction says nothing", minimum=0.0)
+    longest_range_m: float = setting(10_000.0, "m", "no modem here carries farther", minimum=10.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Filtered:
+    """Something seen, and the state after it."""
+
+    one: AnswerSeen | RangeSeen
+    state: DriftState
 
 
 class DriftCorrection:
-    """A Kalman filter over the drift of one vehicle, fed by answers in the order of their times.
+    """The drift of one vehicle, from answers and ranges in any order.
 
-    The leader repeats an answer, and revises it when it learns more. A newer answer for the same
-    state therefore replaces the older one; and when the leader changes its mind by more than the
-    filter can believe, a second answer that agrees with the first makes the filter start over
-    from the deployment.
+    When the leader changes its mind by more than the filter can believe, a second answer that
+    agrees with the first makes the filter start over from the deployment.
     """
 
     def __init__(self, start_time_s: float, settings: CorrectionSettings) -> None:
         self._settings = settings
-        sigmas = np.repeat([settings.start_sigma_m, settings.bias_sigma_mps], 2)
-        self._deployment = _State(
-            time_s=start_time_s, mean=np.zeros(4), covariance=np.diag(sigmas**2)
-        )
-        self._before = self._state = self._deployment  # without and with the newest answer
-        self._aside: tuple[float, Array] | None = None
+        self._filter = DriftFilter(settings)
+        self._deployment = self._base = self._filter.deployed(start_time_s)
+        self._seen: list[_Filtered] = []
+        self._aside: AnswerSeen | None = None
         self.accepted = 0
         self.stale = 0
         self.restarted = 0
         self.gated = 0
+        self.ranges_accepted = 0
+        self.ranges_gated = 0
 
     def receive_answer(
         self, time_s: float, reckoned_m: Array, answered_m: Array, sigma_m: float | None = None
     ) -> bool:
         """Learn from the leader's position (2,) for a past state; return whether it was believed.
 
-        An answer older than the last one used is stale; one that the filter finds impossible is
-        put aside until another confirms it.
+        A later answer for the same state replaces the earlier one. An answer older than all that
+        is kept is stale; one that the filter finds impossible is put aside until another confirms
+        it.
         """
         ran_away_m = np.asarray(reckoned_m - answered_m, dtype=np.float64)
-        if not (np.all(np.isfinite(ran_away_m)) and np.isfinite(time_s)):
+        sane = np.all(np.isfinite(ran_away_m)) and np.isfinite(time_s)
+        if not sane or (sigma_m is not None and not 0.0 < sigma_m < np.inf):
             self.gated += 1
             return False
-        if time_s < self._state.time_s - 1e-6:
+        if time_s < self._base.time_s - 1e-6:
             self.stale += 1
             return False
-        repeats = time_s <= self._state.time_s + 1e-6
-        base = self._before if repeats else self._state
-        sigma_m = sigma_m or self._settings.answer_sigma_m
-        updated = self._updated(base, time_s, ran_away_m, sigma_m)
-        if updated is None:
-            updated = self._confirmed(time_s, ran_away_m, sigma_m)
-            base = self._deployment
-        if updated is None:
+        if sigma_m is None:
+            sigma_m = self._untold_sigma_m(time_s, ran_away_m)
+        answer = AnswerSeen(time_s=time_s, ran_away_m=ran_away_m, sigma_m=sigma_m)
+        self._forget_answer(time_s)
+        if self._filter.chi_square(self._state_at(time_s), answer) <= _CHI_SQUARE_2_999:
+            self._take(answer)
+        elif not self._confirmed(answer):
             return False
-        self._before, self._state = base, updated
         self._aside = None
         self.accepted += 1
         return True
 
+    def receive_range(
+        self,
+        time_s: float,
+        reckoned_m: Array,
+        leader_m: Array,
+        leader_sigma_m: float,
+        range_m: float,
+    ) -> bool:
+        """Learn from the distance to the leader; return whether it was believed."""
+        s = self._settings
+        numbers = [time_s, *reckoned_m, *leader_m, leader_sigma_m, range_m]
+        sane = bool(np.isfinite(numbers).all()) and time_s >= self._base.time_s
+        if not sane or not s.shortest_range_m <= range_m <= s.longest_range_m:
+            self.ranges_gated += 1
+            return False
+        seen = RangeSeen(
+            time_s=time_s,
+            reckoned_m=np.asarray(reckoned_m),
+            leader_m=np.asarray(leader_m),
+            leader_sigma_m=leader_sigma_m,
+            range_m=range_m,
+        )
+        if self._filter.chi_square(self._state_at(time_s), seen) > _CHI_SQUARE_1_99:
+            self.ranges_gated += 1
+            return False
+        self.ranges_accepted += 1
+        self._take(seen)
+        return True
+
     def corrected(self, time_s: float, reckoned_m: Array) -> tuple[Array, Array]:
         """Return the believed position (2,) at the time, and its covariance (2, 2)."""
-        state = self._predicted(self._state, max(time_s, self._state.time_s))
+        newest = self._seen[-1].state if self._seen else self._base
+        state = self._filter.predicted(newest, max(time_s, newest.time_s))
         return np.asarray(reckoned_m - state.mean[:2]), state.covariance[:2, :2]
 
-    def _updated(
-        self, base: "_State", time_s: float, ran_away_m: Array, sigma_m: float
-    ) -> "_State | None":
-        """Return the state with the answer in it, or None if it is beyond the gate."""
-        state = self._predicted(base, time_s)
-        spread_m2 = state.covariance[:2, :2] + sigma_m**2 * np.eye(2)
-        innovation_m = ran_away_m - state.mean[:2]
-        if innovation_m @ np.linalg.solve(spread_m2, innovation_m) > _CHI_SQUARE_2_999:
-            return None
-        gain = np.linalg.solve(spread_m2, state.covariance[:2]).T
-        return _State(
-            time_s=time_s,
-            mean=state.mean + gain @ innovation_m,
-            covariance=state.covariance - gain @ state.covariance[:2],
-        )
+    def _state_at(self, time_s: float) -> DriftState:
+        """Return the state after all that was seen up to the time."""
+        before = [s.state for s in self._seen if s.one.time_s <= time_s]
+        return before[-1] if before else self._base
 
-    def _confirmed(self, time_s: float, ran_away_m: Array, sigma_m: float) -> "_State | None":
-        """Return a state from the deployment and this answer alone, if the one aside agrees."""
-        s, aside = self._settings, self._aside
+    def _take(self, one: AnswerSeen | RangeSeen) -> None:
+        """Put something in its place, and filter again what is later."""
+        later = [s.one for s in self._seen if s.one.time_s > one.time_s]
+        self._seen = self._seen[: len(self._seen) - len(later)]
+        self._filter_on([one, *later])
+        while len(self._seen) > _KEPT:
+            self._base = self._seen.pop(0).state
+
+    def _forget_answer(self, time_s: float) -> None:
+        """Take out the earlier answer for the same state."""
+        for k, s in enumerate(self._seen):
+            if isinstance(s.one, AnswerSeen) and abs(s.one.time_s - time_s) < 1e-6:
+                later = [s.one for s in self._seen[k + 1 :]]
+                self._seen = self._seen[:k]
+                self._filter_on(later)
+                return
+
+    def _filter_on(self, seen: list[AnswerSeen | RangeSeen]) -> None:
+        state = self._seen[-1].state if self._seen else self._base
+        for one in seen:
+            state = self._filter.updated(state, one)
+            self._seen.append(_Filtered(one=one, state=state))
+
+    def _untold_sigma_m(self, time_s: float, ran_away_m: Array) -> float:
+        """Return the sigma of an answer that tells none.
+
+        Before its first closures a leader knows no more than the dead reckoning that it was told,
+        and answers with that. An answer so near to dead reckoning is either such an echo, as
+        uncertain as dead reckoning itself, or a true position of a vehicle that hardly drifted:
+        the variance is the mean of the two, weighted by how likely each is.
+        """
+        s = self._settings
+        alone_m2 = float(self._filter.predicted(self._deployment, time_s).covariance[0, 0])
+        missed_m2 = float(ran_away_m @ ran_away_m)
+        densities = [
+            np.exp(-0.5 * missed_m2 / variance_m2) / variance_m2
+            for variance_m2 in (s.echo_sigma_m**2, alone_m2 + s.answer_sigma_m**2)
+        ]
+        echo = densities[0] / max(sum(densities), 1e-300)
+        return float(np.sqrt(echo * alone_m2 + s.answer_sigma_m**2))
+
+    def _confirmed(self, answer: AnswerSeen) -> bool:
+        """Start over from the deployment with an answer that agrees with the one put aside."""
         self.gated += 1
-        self._aside = (time_s, ran_away_m)
+        aside, self._aside = self._aside, answer
         if aside is None:
-            return None
-        apart_m = float(np.hypot(*(ran_away_m - aside[1])))
-        if apart_m > 4 * sigma_m + 3 * s.bias_sigma_mps * (time_s - aside[0]):
-            return None
+            return False
+        apart_m = float(np.hypot(*(answer.ran_away_m - aside.ran_away_m)))
+        drifted_m = 3 * self._settings.bias_sigma_mps * abs(answer.time_s - aside.time_s)
+        if apart_m > 4 * answer.sigma_m + drifted_m:
+            return False
         self.restarted += 1
-        return self._updated(self._deployment, time_s, ran_away_m, sigma_m)
-
-    def _predicted(self, state: "_State", time_s: float) -> "_State":
-        s, interval_s = self._settings, time_s - state.time_s
-        transition = np.eye(4)
-        transition[:2, 2:] = interval_s * np.eye(2)
-        walk = s.bias_walk**2
-        position_m2 = s.odometry_noise**2 * interval_s + walk * interval_s**3 / 3
-        noise = np.diag(np.repeat([position_m2, walk * interval_s], 2))
-        noise[[0, 1, 2, 3], [2, 3, 0, 1]] = walk * interval_s**2 / 2
-        return _State(
-            time_s=time_s,
-            mean=transition @ state.mean,
-            covariance=transition @ state.covariance @ transition.T + noise,
-        )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _State:
-    """How far dead reckoning has run away and how fast (4,), with covariance (4, 4)."""
-
-    time_s: float
-    mean: Array
-    covariance: Array
+        self._base, self._seen = self._deployment, []
+        self._take(answer)
+        return True

@@ -47,7 +47,7 @@ class FollowerLoop:
         self._link.hear(self._receive, now_s)
 
     def _receive(self, heard: Reception) -> None:
-        self.core.receive_frame(heard.frame, heard.heard_s)
+        self.core.receive_frame(heard.frame, heard.toa_s, heard.heard_s)
 
     def _sense(self, now_s: float) -> None:
         self._sensors.feed(self.core, now_s)

@@ -6,6 +6,7 @@ from firmware.compression.settings import BinningSettings, CompressionSettings
 from firmware.follower.correction import CorrectionSettings
 from firmware.soundings import SonarSettings
 from firmware.submap_builder import SubmapSettings
+from protocol.repeats import RepeatSettings
 from protocol.settings import Settings, setting
 
 
@@ -16,6 +17,14 @@ class FollowerSettings(Settings):
     profile: str = setting(
         "paper", "", "what a sub-map is sent as", choices=("paper", "dense", "lattice")
     )
+    frames_per_submap: int | None = setting(
+        None,
+        "frames",
+        "of `dense` or `lattice`; none: compression.frames, or what the slots allow",
+        minimum=1,
+        maximum=15,
+    )
+    repeats: RepeatSettings = setting(RepeatSettings, "", "lost fragments sent again")
     sonar: SonarSettings = setting(SonarSettings, "", "the multibeam sonar")
     submaps: SubmapSettings = setting(SubmapSettings, "", "what a sub-map is")
     binning: BinningSettings = setting(BinningSettings, "", "how soundings are thinned")

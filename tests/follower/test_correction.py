@@ -53,12 +53,65 @@ def test_repeated_answer_is_not_counted_as_new_evidence() -> None:
         assert often.corrected(700.0, np.zeros(2))[part] == pytest.approx(known)
 
 
-def test_stale_answer_changes_nothing() -> None:
-    correction = taught()
-    before_m = correction.corrected(700.0, np.zeros(2))[0]
+def test_answer_older_than_all_that_is_kept_changes_nothing() -> None:
+    correction = taught(5000.0)
+    before_m = correction.corrected(5100.0, np.zeros(2))[0]
     assert not correction.receive_answer(100.0, drift_m(100.0), np.zeros(2))
-    assert correction.corrected(700.0, np.zeros(2))[0] == pytest.approx(before_m)
+    assert correction.corrected(5100.0, np.zeros(2))[0] == pytest.approx(before_m)
     assert correction.stale == 1
+
+
+def test_answers_that_come_out_of_order_teach_the_same() -> None:
+    times_s = np.arange(80.0, 1000.0, 40.0)
+    forward, shuffled = (DriftCorrection(0.0, CorrectionSettings()) for _ in range(2))
+    for correction, order in ((forward, times_s), (shuffled, np.roll(times_s, 3))):
+        for time_s in order:
+            assert correction.receive_answer(float(time_s), drift_m(time_s), np.zeros(2), 3.0)
+    for a, b in zip(
+        forward.corrected(1000.0, np.zeros(2)), shuffled.corrected(1000.0, np.zeros(2)), strict=True
+    ):
+        assert a == pytest.approx(b)
+
+
+def test_answers_that_only_echo_dead_reckoning_do_not_make_a_follower_sure() -> None:
+    correction = DriftCorrection(0.0, CorrectionSettings())
+    for time_s in np.arange(20.0, 300.0, 10.0):
+        correction.receive_answer(float(time_s), np.ones(2), np.zeros(2))
+    _, covariance_m2 = correction.corrected(300.0, np.zeros(2))
+    assert np.sqrt(covariance_m2[0, 0]) > 15.0
+
+
+def test_many_answers_with_one_lasting_error_do_not_average_it_away() -> None:
+    correction = DriftCorrection(0.0, CorrectionSettings())
+    for time_s in np.arange(80.0, 1000.0, 10.0):
+        correction.receive_answer(float(time_s), drift_m(time_s), np.array([2.0, 0.0]), 2.0)
+    _, covariance_m2 = correction.corrected(1000.0, drift_m(1000.0))
+    assert 1.0 < np.sqrt(covariance_m2[0, 0]) < 3.0
+
+
+def test_ranges_to_the_leader_correct_along_their_direction() -> None:
+    correction = DriftCorrection(0.0, CorrectionSettings())
+    for time_s in np.arange(100.0, 200.0, 10.0):
+        leader_m = np.array([400.0, 3.0 * (time_s - 150.0)])
+        range_m = float(np.hypot(*leader_m))
+        assert correction.receive_range(float(time_s), drift_m(time_s), leader_m, 1.0, range_m)
+    position_m, covariance_m2 = correction.corrected(200.0, drift_m(200.0))
+    assert position_m[0] == pytest.approx(0.0, abs=2.5)
+    assert covariance_m2[0, 0] < covariance_m2[1, 1]
+
+
+def test_stretched_range_is_gated() -> None:
+    correction = taught()
+    leader_m = np.array([800.0, 0.0])
+    at_m = drift_m(610.0)
+    assert not correction.receive_range(610.0, at_m, leader_m, 1.0, 880.0)
+    assert correction.ranges_gated == 1
+
+
+@pytest.mark.parametrize("bad_m", [0.0, -5.0, np.nan, np.inf, 100_000.0])
+def test_range_that_cannot_be_is_dropped(bad_m: float) -> None:
+    correction = taught()
+    assert not correction.receive_range(610.0, np.zeros(2), np.array([9.0, 500.0]), 1.0, bad_m)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])

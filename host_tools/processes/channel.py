@@ -3,7 +3,6 @@
 import argparse
 import shlex
 import sys
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Never
@@ -16,6 +15,7 @@ from host_tools.evaluation import evaluate
 from host_tools.mapping import DepthMap
 from host_tools.mission import Progress, run, simulated_vehicles, water_between
 from host_tools.processes.fleet import Fleet, OnWait
+from host_tools.processes.pace import Pace
 from host_tools.processes.records import FOLDER, VehicleFiles
 from host_tools.processes.remote_node import RemoteNode
 from host_tools.processes.voyage import Voyage, add_voyage_arguments, voyage_of
@@ -37,7 +37,7 @@ def host_mission(
     on_wait: OnWait,
     progress: Progress,
     ports: Path | None = None,
-    pace: "Pace | None" = None,
+    pace: Pace | None = None,
 ) -> MissionResult:
     """Return a mission whose vehicles are processes, from the files that they leave in out.
 
@@ -54,10 +54,8 @@ def host_mission(
         voyage.fingerprint,
         on_wait=on_wait,
         folder=ports,
-        is_overdue=pace.is_over if pace is not None else lambda _: False,
+        pace=pace,
     ) as fleet:
-        for node in fleet.nodes.values():
-            node.in_real_time = pace is not None
         ready(fleet)
         fleet.wait_for_all()
         if pace is not None:
@@ -97,30 +95,6 @@ def _result(
         deliveries,
         truth_map,
     )
-
-
-class Pace:
-    """Real time: every tick lasts as long on the wall as in the mission."""
-
-    def __init__(self, tick_s: float) -> None:
-        self._tick_s, self._began_s = tick_s, 0.0
-
-    def start(self) -> None:
-        """Let mission time 0 be now."""
-        self._began_s = time.monotonic()
-
-    def is_over(self, now_s: float) -> bool:
-        """Return whether the tick's own time is up: a vehicle that has not answered is late."""
-        return time.monotonic() - self._began_s >= now_s + self._tick_s
-
-    def after(self, progress: Progress) -> Progress:
-        """Return progress, followed by a wait for the end of the tick."""
-
-        def wait(now_s: float) -> None:
-            progress(now_s)
-            time.sleep(max(0.0, self._began_s + now_s + self._tick_s - time.monotonic()))
-
-        return wait
 
 
 def vehicle_command(fleet: Fleet, node: RemoteNode, voyage: Voyage, out: Path) -> list[str]:

@@ -11,6 +11,7 @@ from types import TracebackType
 
 from host_tools.emulators.ptys import PseudoPort
 from host_tools.processes.control import ControlLine, Done, End, Hello, Refused
+from host_tools.processes.pace import Pace
 from host_tools.processes.remote_node import RemoteNode
 from host_tools.processes.served_clock import CLOCK_SCHEME
 from protocol.acoustics import Water
@@ -19,6 +20,7 @@ from protocol.modems.serial_line import DEFAULT_BAUD
 
 WAIT_S = 0.2
 """Of real time, between two looks at what else may have happened."""
+PACED_WAIT_S, LATE_WAIT_S = 0.01, 0.0
 BACKLOG = 8
 
 OnWait = Callable[[Sequence[RemoteNode]], None]
@@ -28,7 +30,7 @@ class Fleet:
     """Ports, control socket and nodes; the clock stands still while a process is down.
 
     on_wait is called now and then while processes are waited for, with those that are missing; it
-    may raise to give up. deadline, for real time, says whether a node need not be waited for.
+    may raise to give up. With a pace time is real: nobody who is late or down is waited for.
     """
 
     def __init__(
@@ -38,10 +40,10 @@ class Fleet:
         *,
         on_wait: OnWait,
         folder: Path | None = None,
-        is_overdue: Callable[[float], bool] = lambda _: False,
+        pace: Pace | None = None,
     ) -> None:
         self.water, self.on_wait = water, on_wait
-        self._mission, self._is_overdue = mission, is_overdue
+        self._mission, self._pace = mission, pace
         self._made = folder is None
         self.folder = Path(tempfile.mkdtemp(prefix="fathomlink-")) if folder is None else folder
         self._now_s = -1.0
@@ -59,6 +61,8 @@ class Fleet:
             )
             for vehicle in water.nodes
         }
+        for node in self.nodes.values():
+            node.in_real_time = pace is not None
 
     def __enter__(self) -> "Fleet":
         return self
@@ -99,8 +103,10 @@ class Fleet:
 
     def until_answered(self, node: RemoteNode) -> None:
         """Wait for a process's answer; while it is down, for it to come back."""
-        while not node.is_answered and not self._is_overdue(self._now_s):
-            self.look()
+        is_over = False
+        while not (node.is_answered or is_over):
+            is_over = self._pace is not None and self._pace.is_over(self._now_s)
+            self.look(LATE_WAIT_S if is_over else WAIT_S if self._pace is None else PACED_WAIT_S)
 
     def end(self) -> None:
         """Tell all processes that the mission is over, and wait for their files."""
@@ -108,7 +114,9 @@ class Fleet:
         for node in self.nodes.values():
             if node.line is not None:
                 node.line.send(End())
-        while self._ended != {node.vehicle for node in self.nodes.values()}:
+        while len(self._ended) < len(self.nodes):
+            if self._pace is not None and len(self._ended) + len(self.missing()) == len(self.nodes):
+                return
             self.look()
 
     def close(self) -> None:
@@ -142,11 +150,11 @@ class Fleet:
         listener.listen(BACKLOG)
         return listener
 
-    def look(self) -> None:
+    def look(self, wait_s: float = WAIT_S) -> None:
         """Wait a moment for anything that a process says, and act on it."""
         lines = [n.line for n in self.nodes.values() if n.line is not None] + self._strangers
         waited: list[socket.socket | ControlLine] = [self._socket, *lines]
-        ready = select.select(waited, [], [], WAIT_S)[0]
+        ready = select.select(waited, [], [], wait_s)[0]
         if self._socket in ready:
             self._strangers.append(ControlLine(self._socket.accept()[0]))
         for node in self.nodes.values():

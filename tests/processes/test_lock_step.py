@@ -1,6 +1,9 @@
 """The channel's end and a vehicle's end over real ptys, the vehicle in a thread."""
 
+import shutil
+import subprocess
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,8 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from firmware.ports import ModemPort
 from host_tools.mission import run
 from host_tools.processes.fleet import Fleet
+from host_tools.processes.pace import Pace
 from host_tools.processes.remote_node import MOST_TRIES, RemoteNode
 from host_tools.processes.served_clock import ServedClock, StampedModem
 from protocol.acoustics import Delivery, Water, WaterSettings
@@ -226,3 +231,54 @@ def test_a_clock_that_is_not_there_is_one_line(tmp_path: Path) -> None:
         ServedClock(f"unix://{tmp_path}/clock", 0, "m", modem)
     with pytest.raises(ConfigError, match="give wall, or the unix:// name"):
         ServedClock("clock", 0, "m", modem)
+
+
+class FastPace(Pace):
+    """Real time, a thousand times as fast."""
+
+    def is_over(self, now_s: float) -> bool:
+        return super().is_over(now_s / 1000.0)
+
+
+def test_in_real_time_a_process_that_is_down_is_not_waited_for(tmp_path: Path) -> None:
+    pace = FastPace(TICK_S / 1000.0)
+    with Fleet(water(), "m", on_wait=lambda _: None, folder=tmp_path, pace=pace) as fleet:
+        leader, follower = Talker(0, fleet), Talker(1, fleet, stop_at_s=5.0)
+        threads = [leader.start(), follower.start()]
+        fleet.wait_for_all()
+        pace.start()
+        deliveries: list[Delivery] = []
+        run(
+            fleet.nodes,
+            fleet.water,
+            duration_s=20.0,
+            tick_s=TICK_S,
+            record=deliveries.append,
+        )
+        fleet.end()
+        missed = fleet.nodes[1].status()["periods_missed"]
+        for thread in threads:
+            thread.join()
+    assert missed >= 55
+    assert leader.error is None
+
+
+@pytest.mark.skipif(shutil.which("socat") is None, reason="apt-get install socat")
+def test_frames_cross_a_pair_of_ports_made_by_socat(tmp_path: Path) -> None:
+    names = [tmp_path / "a", tmp_path / "b"]
+    pair = subprocess.Popen(["socat", *(f"pty,raw,echo=0,link={name}" for name in names)])
+    try:
+        end_s = time.monotonic() + 10.0
+        while not all(name.exists() for name in names) and time.monotonic() < end_s:
+            time.sleep(0.005)
+        ends = [ModemPort(open_modem(f"serial://{name}")) for name in names]
+        heard: list[list[bytes]] = [[], []]
+        for k in range(1, 11):
+            ends[k % 2].speak(lambda _, k=k: bytes([k]) * 256, float(k))  # type: ignore[misc]
+        while len(heard[0]) + len(heard[1]) < 10 and time.monotonic() < end_s:
+            for end, frames in zip(ends, heard, strict=True):
+                end.hear(lambda r, frames=frames: frames.append(r.frame), 11.0)  # type: ignore[misc]
+    finally:
+        pair.terminate()
+        pair.wait()
+    assert heard == [[bytes([k]) * 256 for k in range(first, 11, 2)] for first in (1, 2)]

@@ -12,7 +12,8 @@ import numpy as np
 from benchmarks.compression_peers import Coded, points_decoder
 from benchmarks.compression_windows import Window
 from firmware.compression.binning import coarsened
-from firmware.compression.initial import dealt_fragments, initial_points
+from firmware.compression.expected import run
+from firmware.compression.initial import dealt_fragments, initial_point_steps
 from firmware.compression.kernels import Hyperparameters, Kernel
 from firmware.geometry import Array
 
@@ -38,7 +39,7 @@ def sgpr(window: Window, *, all_soundings: bool, iterations: int = ITERATIONS) -
     torch.set_num_threads(1)
     cells = coarsened(window.bins, 2.0)
     position_m = np.column_stack([cells.north_m, cells.east_m])
-    start_m, _ = initial_points(position_m, cells.depth_m, 150)
+    start_m, _ = run(initial_point_steps(position_m, cells.depth_m, 150))
     depth_m = cells.depth_m
     if all_soundings:
         position_m, depth_m = window.soundings_ned_m[:, :2], window.soundings_ned_m[:, 2]

@@ -224,19 +224,27 @@ class SoundingBins:
         """Return the median and robust spread of the cell medians in the 5 x 5 cells around."""
         with np.errstate(invalid="ignore"):
             median_m = _median(held_m)
-        around = np.full((self._keys.size, 25), np.nan)
+        centre_m, spread_m = np.empty(self._keys.size), np.empty(self._keys.size)
+        for start in range(0, self._keys.size, _CHUNK):
+            part = slice(start, start + _CHUNK)
+            around = self._around(self._keys[part], median_m)
+            centre_m[part] = _median(around)
+            spread_m[part] = _SIGMA_PER_MAD * _median(np.abs(around - centre_m[part, None]))
+            few = np.isfinite(around).sum(axis=1) < 4
+            spread_m[part][few] = np.maximum(spread_m[part][few], 2.0 * sigma_m)
+        return centre_m, spread_m
+
+    def _around(self, keys: NDArray[np.int64], median_m: Array) -> Array:
+        """Return the medians in the 5 x 5 cells around each of the keys, (K, 25), NaN if empty."""
+        around = np.full((keys.size, 25), np.nan)
         for step in range(5):
-            lowest = self._keys + (step - 2) * _ROW_STRIDE - 2
+            lowest = keys + (step - 2) * _ROW_STRIDE - 2
             at = np.searchsorted(self._keys, lowest)
             for ahead in range(5):
                 row = np.minimum(at + ahead, self._keys.size - 1)
                 inside = (at + ahead < self._keys.size) & (self._keys[row] <= lowest + 4)
                 around[inside, 5 * step + ahead] = median_m[row[inside]]
-        centre_m = _median(around)
-        spread_m = _SIGMA_PER_MAD * _median(np.abs(around - centre_m[:, None]))
-        few = np.isfinite(around).sum(axis=1) < 4
-        spread_m[few] = np.maximum(spread_m[few], 2.0 * sigma_m)
-        return centre_m, spread_m
+        return around
 
 
 def coarsened(bins: BinnedSoundings, cell_m: float) -> BinnedSoundings:

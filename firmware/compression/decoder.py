@@ -15,7 +15,7 @@ from firmware.geometry import Array
 from protocol.errors import EstimationError
 
 NUGGET = 1e-4  # of c: the least that keeps 150 points solvable; sigma^2 would smooth twice
-_ROWS = 4096  # kernel rows held at once
+_ROWS = 1024  # kernel rows held at once: 3 MB for 150 points, and they stay in the cache
 _TRIES = 6  # the nugget grows tenfold each time, up to 10 c
 
 

@@ -38,7 +38,7 @@ _HEAD = struct.Struct(">9fHH")  # hyperparameters, north, east, depth at level 0
 _LEVELS = 4095
 _FIRST_POINTS = 40  # what half of the frames gives: one point in 20 m
 _TRACK_BYTES = 20  # a straight track takes 15; a longer one costs a few points
-_RARELY = 0.05  # how often fewer frames than the second threshold may arrive
+_RARELY = 0.02  # how often fewer frames than the second threshold may arrive
 _PACK_EVERY = 6
 
 Levels = NDArray[np.int64]

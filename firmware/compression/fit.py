@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware.compression.expected import Evaluation, ExpectedError
-from firmware.compression.initial import Outline, dealt_fragments, initial_points
+from firmware.compression.initial import Outline, dealt_fragments, initial_point_steps
 from firmware.compression.kernels import Kernel
 from firmware.compression.lbfgs import Improvement, Trial, minimise_steps
 from firmware.compression.losses import LossPatterns, loss_patterns
@@ -104,7 +104,7 @@ def fit_steps(
     frame: FitFrame, count: int, settings: CompressionSettings, deal: Dealer
 ) -> Generator[FittedPoints | None, None, str]:
     """Yield ever better fits, and None between small steps; the value says why it ended."""
-    start_m, held = initial_points(frame.position_m, frame.depth_m, count)
+    start_m, held = yield from initial_point_steps(frame.position_m, frame.depth_m, count)
     yield None
     spacing_m = spacing_of(start_m)
     dealing = deal(start_m)

@@ -6,7 +6,7 @@ import numpy as np
 
 from firmware.compression.fit import Dealer, FitFrame, FittedPoints, spacing_of
 from firmware.compression.fitc import Fitc, FitcEvaluation, FitcParameters
-from firmware.compression.initial import initial_points
+from firmware.compression.initial import initial_point_steps
 from firmware.compression.kernels import Kernel
 from firmware.compression.lbfgs import Trial, minimise_steps
 from firmware.compression.settings import CompressionSettings
@@ -19,7 +19,7 @@ def fitc_steps(
     frame: FitFrame, count: int, settings: CompressionSettings, deal: Dealer
 ) -> Generator[FittedPoints | None, None, str]:
     """Yield ever likelier fits, and None between small steps; the value says why it ended."""
-    start_m, _ = initial_points(frame.position_m, frame.depth_m, count)
+    start_m, _ = yield from initial_point_steps(frame.position_m, frame.depth_m, count)
     yield None
     spacing_m = spacing_of(start_m)
     kernel = Kernel.SQUARED_EXPONENTIAL

@@ -3,6 +3,7 @@
 Some points go to the rim, because the leader maps only inside the hull of what it receives.
 """
 
+from collections.abc import Generator
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,16 +90,20 @@ def _main_axis(position_m: Array) -> Array:
     return axis
 
 
-def initial_points(position_m: Array, depth_m: Array, count: int) -> tuple[Array, int]:
-    """Return starting positions (M, 2) and how many of them, the first, sit on the rim.
+def initial_point_steps(
+    position_m: Array, depth_m: Array, count: int
+) -> Generator[None, None, tuple[Array, int]]:
+    """Find starting positions (M, 2) and how many of them, the first, sit on the rim.
 
-    Lloyd's iteration on cells weighted by roughness, with the rim held. M is `count` or the number
-    of cells if that is less.
+    The generator's value is both. Lloyd's iteration on cells weighted by roughness, with the rim
+    held. M is `count` or the number of cells if that is less.
     """
     if len(position_m) <= count:
         return position_m.copy(), len(position_m)
     rim_m = rim(position_m, int(count * _RIM_SHARE))
+    yield
     weight = roughness(position_m, depth_m)
+    yield
     weight = (weight / max(float(np.median(weight)), 1e-6)) ** _ROUGHNESS_POWER
     weight = np.clip(weight, 0.2, 5.0)
     order = hilbert_order(position_m)
@@ -113,6 +118,7 @@ def initial_points(position_m: Array, depth_m: Array, count: int) -> tuple[Array
             total = np.bincount(owner, weight * position_m[:, axis], count)[len(rim_m) :]
             own = mass[len(rim_m) :]
             inner_m[own > 0, axis] = total[own > 0] / own[own > 0]
+        yield
     return np.vstack([rim_m, inner_m]), len(rim_m)
 
 

@@ -55,7 +55,7 @@ class CompressionSettings(Settings):
         4096, "rows", "bounds memory and the longest step", minimum=64, maximum=65536
     )
     iterations: int = setting(
-        30, "evaluations", "0.3 s of one core; the error is then within 5 % of settled", minimum=0
+        28, "evaluations", "0.3 s of one core; the error is then within 5 % of settled", minimum=0
     )
     dense_iterations: int = setting(
         12, "evaluations", "of `dense`, each four times dearer than one of `paper`", minimum=0

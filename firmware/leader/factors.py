@@ -19,6 +19,7 @@ from firmware.leader.ledger import (
 _QUARTER_TURN = np.array([[0.0, -1.0], [1.0, 0.0]])
 _POSITION = np.eye(2, 4)  # takes a node's state to its position
 _BIAS = np.eye(2, 4, 2)  # and this to its bias
+_NOTHING_SAID = 1e8  # (m/s)^2: ten kilometres a second of bias is no statement
 _Jacobians = list[Array] | None
 
 
@@ -33,7 +34,7 @@ def factor_of(record: Record, robust_kernel: float) -> gtsam.NonlinearFactor:
         case SharedDriftRecord():
             return _shared_drift(record)
         case ClosureRecord():
-            return _closure(record, _robust(record.covariance_m2, robust_kernel))
+            return _closure(record, robust_kernel)
         case RangeRecord():
             return _range(record, _robust(np.array([[record.sigma_m**2]]), robust_kernel))
         case AbsoluteRecord():
@@ -90,15 +91,17 @@ def _custom(
     return gtsam.CustomFactor(noise, keys, error)
 
 
-def _closure(record: ClosureRecord, noise: gtsam.noiseModel.Base) -> gtsam.NonlinearFactor:
-    keys = [record.origin.key, record.target.key]
+def _closure(record: ClosureRecord, robust_kernel: float) -> gtsam.NonlinearFactor:
+    """Return a factor between whole states, whose biases it says nothing about.
 
-    def error(_this: object, values: gtsam.Values, jacobians: _Jacobians) -> Array:
-        if jacobians is not None:
-            jacobians[0], jacobians[1] = -_POSITION, _POSITION
-        return record.innovation_m(values.atVector(keys[0])[:2], values.atVector(keys[1])[:2])
-
-    return _custom(noise, keys, error)
+    It stands for a factor between positions because gtsam evaluates it without calling Python.
+    """
+    between = np.zeros(4)
+    between[:2] = record.offset_m + record.origin.offset_m - record.target.offset_m
+    covariance = _NOTHING_SAID * np.eye(4)
+    covariance[:2, :2] = record.covariance_m2
+    noise = _robust(covariance, robust_kernel)
+    return gtsam.BetweenFactorVector(record.origin.key, record.target.key, between, noise)
 
 
 def _range(record: RangeRecord, noise: gtsam.noiseModel.Base) -> gtsam.NonlinearFactor:

@@ -95,7 +95,8 @@ class PoseGraph:
         self._changed: set[int] = set()
         self._values = gtsam.Values()
         self._fresh = gtsam.Values()
-        self._isam = _new_isam()
+        self._factorization = "CHOLESKY"  # until it calls a long chain indeterminate: then QR
+        self._isam = _new_isam(self._factorization)
         self._factorised: tuple[SuperLU, dict[int, int]] | None = None
         self._trajectories: dict[int, Trajectory] = {}  # both until the next change
         self._newest_covariance: dict[int, Array] = {}
@@ -239,6 +240,7 @@ class PoseGraph:
                     break
             self._values = self._isam.calculateEstimate()
         except RuntimeError:
+            self._factorization = "QR"
             self._values.insert(self._fresh)
             self._rebuild(self._values)
         self._fresh = gtsam.Values()
@@ -361,7 +363,7 @@ class PoseGraph:
         for entry in self._ledger:
             entry.slot = None
         graph, entries = self._active_factors()
-        self._isam = _new_isam()
+        self._isam = _new_isam(self._factorization)
         result = self._isam.update(graph, values)
         for entry, slot in zip(entries, result.getNewFactorsIndices(), strict=True):
             entry.slot = slot
@@ -396,10 +398,9 @@ class PoseGraph:
         return self._factorised
 
 
-def _new_isam() -> gtsam.ISAM2:
+def _new_isam(factorization: str) -> gtsam.ISAM2:
     parameters = gtsam.ISAM2Params()
-    parameters.setOptimizationParams(gtsam.ISAM2DoglegParams())  # ranges may be far from linear
-    parameters.setFactorization("QR")  # Cholesky calls a long dead-reckoned chain indeterminate
+    parameters.setFactorization(factorization)
     parameters.setRelinearizeThreshold(0.02)
     parameters.relinearizeSkip = 1
     parameters.findUnusedFactorSlots = True  # memory stays with what is active

@@ -107,7 +107,7 @@ def test_long_chain_without_closures_stays_solvable() -> None:
     track = Track(time_s=time_s, north_m=2 * time_s, east_m=0 * time_s, yaw_rad=0 * time_s)
     graph = started(track)
     graph.update()
-    assert graph.rebuilds == 0
+    assert graph.rebuilds <= 1  # once, when Cholesky gives the chain up
     assert graph.trajectory(0).position_m[-1] == pytest.approx([2 * time_s[-1], 0.0], abs=1e-3)
 
 

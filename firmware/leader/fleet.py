@@ -65,7 +65,7 @@ class Fleet:
 
     def vehicles(self) -> list[int]:
         """Return the vehicles that have a chain, the leader first."""
-        return list(dict.fromkeys(vehicle_of(chain) for chain in self._graph.vehicles()))
+        return sorted({vehicle_of(chain) for chain in self._graph.vehicles()})
 
     def boot_of(self, header: Header) -> int:
         """Return which boot a frame is of; of late frames an earlier one than the newest."""

@@ -1,0 +1,199 @@
+"""A leader that survives a kill: inputs and what matches found go to a journal.
+
+Matching is not done again in a replay: the outcomes are inputs, in the order in which they came.
+"""
+
+import contextlib
+import dataclasses
+import json
+import logging
+import struct
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from firmware.belief import Belief
+from firmware.dead_reckoning import ReckonedState
+from firmware.inputs import Heard, Kind, from_state, to_instant, to_state
+from firmware.journal import Journal, StoreUnusableError
+from firmware.leader.core import LeaderCore, SheetJobs
+from firmware.leader.matches import Match, MatchOutcome, NoMatch
+from firmware.leader.settings import LeaderSettings
+from firmware.recorder import Recorder
+from firmware.soundings import Odometry, Ping
+from protocol.schedule import Slots
+
+LOG = logging.getLogger(__name__)
+_NOW = struct.Struct("<d")
+
+
+class JournaledLeader(LeaderCore):
+    """A leader's core behind its journal; resumed from it where there is something to resume.
+
+    The start is that of a vehicle without a past.
+    """
+
+    def __init__(
+        self,
+        journal: Journal,
+        start: ReckonedState,
+        *,
+        settings: LeaderSettings,
+        slots: Slots,
+    ) -> None:
+        self.recorder = Recorder(journal)
+        self._made_with = (settings, slots)
+        self._is_within = False
+        self._unfinished: list[SheetJobs] = []  # at most one: the worker takes one at a time
+        self._make(start)
+        if journal.is_resumed:
+            try:
+                self._resume()
+            except StoreUnusableError as error:
+                journal.give_up(str(error))
+                self.recorder, self._unfinished = Recorder(journal), []
+                self._make(start)
+
+    def receive_odometry(self, odometry: Odometry) -> None:
+        """Record and advance."""
+        fresh = self.recorder.odometry(odometry)
+        if fresh is not None:
+            super().receive_odometry(fresh)
+
+    def receive_ping(self, ping: Ping) -> None:
+        """Record and add a ping."""
+        fresh = self.recorder.ping(ping)
+        if fresh is not None:
+            super().receive_ping(fresh)
+
+    def receive_frame(self, frame: bytes, toa_s: float | None, now_s: float) -> None:
+        """Take a frame and the arrival of its first bit; both are on disk when this returns."""
+        if self.recorder.frame(Heard(frame=frame, toa_s=toa_s, now_s=now_s)):
+            super().receive_frame(frame, toa_s, now_s)
+
+    def tick(self, now_s: float) -> None:
+        """Record and work."""
+        if self.recorder.tick(now_s):
+            super().tick(now_s)
+
+    def next_jobs(self) -> SheetJobs | None:
+        """Return the matches that wait; first those that a kill has cut short."""
+        if self._unfinished:
+            return self._unfinished.pop()
+        jobs = super().next_jobs()
+        if jobs is not None:
+            self.recorder.note(Kind.JOBS)
+        return jobs
+
+    def finish(self, done: SheetJobs, outcomes: list[MatchOutcome], now_s: float) -> None:
+        """Record what the matches found, and judge it as a replay will."""
+        body = from_outcomes(outcomes, now_s)
+        self.recorder.note(Kind.OUTCOMES, body)
+        super().finish(done, to_outcomes(body)[0], now_s)
+
+    def poll(self, now_s: float) -> bytes | None:
+        """Return the answer to transmit now, or None; what led to it is on disk."""
+        if not self.recorder.poll(now_s):
+            return self.recorder.polled(now_s)
+        with self._within():
+            frame = super().poll(now_s)
+        return self.recorder.before_sending(frame)
+
+    def belief(self) -> Belief:
+        """Return where the leader believes itself to be; asking may settle the graph."""
+        if not self._is_within:
+            self.recorder.note(Kind.BELIEF)
+        return super().belief()
+
+    def status(self) -> dict[str, int]:
+        """Return every counter, the store's among them."""
+        return {**super().status(), **self.recorder.journal.counters}
+
+    def _make(self, start: ReckonedState) -> None:
+        settings, slots = self._made_with
+        journal = self.recorder.journal
+        kept = to_state(journal.start(from_state(start)))
+        super().__init__(journal.boot_epoch, kept, settings=settings, slots=slots)
+
+    @contextlib.contextmanager
+    def _within(self) -> Iterator[None]:
+        """Let the core ask itself without a record: a replay makes it ask itself again."""
+        self._is_within = True
+        try:
+            yield
+        finally:
+            self._is_within = False
+
+    def _resume(self) -> None:
+        for kind, body in self.recorder.journal.replay():
+            try:
+                with self._within():
+                    self._replay(kind, body)
+            except StoreUnusableError:
+                raise
+            except Exception:  # as the loop did when it came for the first time
+                self.recorder.journal.counters["store_inputs_failed"] += 1
+                LOG.exception("an input failed again in the replay")
+        self.recorder.resume()
+
+    def _replay(self, kind: int, body: bytes) -> None:
+        recorder = self.recorder
+        match kind:
+            case Kind.ODOMETRY:
+                super().receive_odometry(recorder.replayed_odometry(body))
+            case Kind.PING:
+                super().receive_ping(recorder.replayed_ping(body))
+            case Kind.FAN:
+                recorder.replayed_fan(body)
+            case Kind.FRAME:
+                heard = recorder.replayed_frame(body)
+                super().receive_frame(heard.frame, heard.toa_s, heard.now_s)
+            case Kind.TICK:
+                super().tick(recorder.replayed_tick(body))
+            case Kind.POLL:
+                now_s = to_instant(body)
+                recorder.replayed_poll(now_s, super().poll(now_s))
+            case Kind.BELIEF:
+                super().belief()
+            case Kind.JOBS:
+                jobs = super().next_jobs()
+                self._unfinished = [] if jobs is None else [jobs]
+            case Kind.OUTCOMES:
+                outcomes, now_s = to_outcomes(body)
+                super().finish(self._unfinished.pop(), outcomes, now_s)
+            case _:
+                raise StoreUnusableError(f"a leader has no input of kind {kind}")
+
+
+def from_outcomes(outcomes: Sequence[MatchOutcome], now_s: float) -> bytes:
+    """Return outcomes and the time of their judgement as bytes; numbers read back exactly."""
+    rows = [
+        _columns(outcome.match) if outcome.match else (outcome.reason or NoMatch.EMPTY).name
+        for outcome in outcomes
+    ]
+    return _NOW.pack(now_s) + json.dumps(rows, separators=(",", ":")).encode()
+
+
+def to_outcomes(body: bytes) -> tuple[list[MatchOutcome], float]:
+    """Return the outcomes and the time of bytes."""
+    (now_s,) = _NOW.unpack_from(body)
+    outcomes = []
+    for row in json.loads(body[_NOW.size :]):
+        if isinstance(row, str):
+            outcomes.append(MatchOutcome(match=None, reason=NoMatch[row]))
+            continue
+        values: dict[str, Any] = {
+            name: np.array(value) if isinstance(value, list) else value
+            for name, value in row.items()
+        }
+        outcomes.append(MatchOutcome(match=Match(**values), reason=None))
+    return outcomes, now_s
+
+
+def _columns(found: Match) -> dict[str, object]:
+    return {field.name: _plain(getattr(found, field.name)) for field in dataclasses.fields(Match)}
+
+
+def _plain(value: object) -> object:
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value

@@ -1,0 +1,196 @@
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware.follower.journaled import JournaledFollower
+from firmware.inputs import fan_of, from_ping, to_ping
+from firmware.journal import Journal, JournalSettings, Owner
+from firmware.leader.journaled import JournaledLeader, from_outcomes, to_outcomes
+from firmware.leader.matches import Match, MatchOutcome, NoMatch
+from firmware.soundings import Ping
+from host_tools.kills import Fate, MortalJournal, MortalNode, SensorTape
+from host_tools.mission import deployed, run, simulated_vehicles, water_between
+from host_tools.mission_settings import MissionSettings, changed
+from host_tools.nodes import FollowerNode, LeaderNode
+from host_tools.simulator.placement import place_survey
+from host_tools.simulator.terrain import open_terrain
+from host_tools.simulator.vehicle import SimulatedVehicle
+from protocol.acoustics import Delivery
+from protocol.schedule import Slots
+
+SHORT = {"duration_min": 3.0, "follower_duration_min": 2.5, "leg_m": 60.0, "beams": 32}
+KILLS = 10
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Told:
+    deliveries: list[Delivery]
+    beliefs: list[np.ndarray]
+    trajectories: dict[int, np.ndarray]
+    counters: list[dict[str, int]]
+    nodes: list[MortalNode]
+    kills: int
+
+
+def mission(folder: Path, kills: int, seed: int = 4) -> Told:
+    settings = changed(MissionSettings(), SHORT)
+    site = place_survey(open_terrain(None, 1), settings.scenario, seed)
+    vehicles = simulated_vehicles(settings, site, seed)
+    fates = [
+        Fate(np.random.default_rng([seed, v.index]), kills, 2000.0 / max(kills, 1))
+        for v in vehicles
+    ]
+    nodes = {
+        v.index: MortalNode(
+            lambda tape, v=v: board(settings, v, fates[v.index], folder, tape),  # type: ignore[misc]
+            v.steps(),
+            0.25,
+        )
+        for v in vehicles
+    }
+    deliveries: list[Delivery] = []
+    water = water_between(settings, vehicles, seed)
+    run(nodes, water, duration_s=180.0, tick_s=0.25, record=deliveries.append)
+    leader = nodes[0].core
+    assert isinstance(leader, JournaledLeader)
+    return Told(
+        deliveries=deliveries,
+        beliefs=[node.log.columns()["live_m"] for node in nodes.values()],
+        trajectories={v: leader.trajectory(v).position_m for v in leader.vehicles()},
+        counters=[
+            {k: n for k, n in node.core.status().items() if not k.startswith("store")}
+            for node in nodes.values()
+        ],
+        nodes=list(nodes.values()),
+        kills=sum(fate.kills for fate in fates),
+    )
+
+
+def board(
+    settings: MissionSettings, vehicle: SimulatedVehicle, fate: Fate, folder: Path, tape: SensorTape
+) -> LeaderNode | FollowerNode:
+    owner = Owner(vehicle=vehicle.index, fingerprint="test")
+    journal = MortalJournal(folder, owner, JournalSettings(checkpoint_s=30.0), fate)
+    start, slots = deployed(vehicle), Slots(settings.slots)
+    if vehicle.index == 0:
+        return LeaderNode(
+            JournaledLeader(journal, start, settings=settings.leader, slots=slots), tape
+        )
+    core = JournaledFollower(journal, 1, start, settings=settings.follower, slots=slots)
+    return FollowerNode(core, tape)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Told:
+    return mission(tmp_path_factory.mktemp("undisturbed"), 0)
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory: pytest.TempPathFactory) -> Told:
+    return mission(tmp_path_factory.mktemp("killed"), KILLS)
+
+
+def test_kills_change_no_frame_no_belief_and_no_estimate(undisturbed: Told, killed: Told) -> None:
+    assert undisturbed.kills == 0
+    assert killed.kills == 2 * KILLS
+    assert len(killed.deliveries) > 30
+    assert killed.deliveries == undisturbed.deliveries
+    for ours, theirs in zip(killed.beliefs, undisturbed.beliefs, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    assert killed.trajectories.keys() == undisturbed.trajectories.keys() == {0, 1}
+    for vehicle, positions_m in undisturbed.trajectories.items():
+        np.testing.assert_array_equal(killed.trajectories[vehicle], positions_m)
+
+
+def test_every_counter_is_what_it_would_have_been(undisturbed: Told, killed: Told) -> None:
+    assert killed.counters == undisturbed.counters
+
+
+def test_nothing_is_sent_while_catching_up_nor_told_differently(killed: Told) -> None:
+    for node in killed.nodes:
+        assert node.stray_frames == 0
+        assert node.differing == 0
+
+
+def test_follower_writes_itself_down_so_that_its_store_stays_small(undisturbed: Told) -> None:
+    journal = undisturbed.nodes[1].core.recorder.journal
+    assert journal.counters["store_checkpoints"] >= 4
+    assert journal.counters["store_set_aside"] == 0
+
+
+def test_ping_reads_back_within_float32_and_then_exactly() -> None:
+    ping = Ping(
+        time_s=1.25,
+        slant_ranges_m=np.array([40.123456789, np.nan, 1e9]),
+        beam_angles_rad=np.array([-1.0, 0.0, 1.0]),
+        roll_rad=0.01,
+        pitch_rad=-0.02,
+        yaw_rad=3.0,
+        depth_m=10.1,
+    )
+    once = to_ping(from_ping(ping), fan_of(ping))
+    twice = to_ping(from_ping(once), fan_of(once))
+    np.testing.assert_allclose(once.slant_ranges_m, ping.slant_ranges_m, rtol=6e-8)
+    np.testing.assert_array_equal(once.slant_ranges_m, twice.slant_ranges_m)
+    np.testing.assert_array_equal(once.beam_angles_rad, ping.beam_angles_rad)
+    assert (once.time_s, once.roll_rad, once.depth_m) == (1.25, 0.01, 10.1)
+
+
+def test_ping_of_no_use_keeps_only_its_number_of_beams() -> None:
+    ping = Ping(
+        time_s=0.0,
+        slant_ranges_m=np.ones((2, 3)),
+        beam_angles_rad=np.ones(4),
+        roll_rad=0.0,
+        pitch_rad=0.0,
+        yaw_rad=0.0,
+        depth_m=np.nan,
+    )
+    kept = to_ping(from_ping(ping), fan_of(ping))
+    assert kept.slant_ranges_m.size == 6
+    assert not np.isfinite(kept.slant_ranges_m).any()
+
+
+def test_outcomes_read_back_exactly() -> None:
+    found = Match(
+        shift_m=np.array([1 / 3, -2e-17]),
+        covariance_m2=np.array([[0.1, 0.01], [0.01, np.float64(0.3)]]),
+        residual=0.1,
+        overlap_cells=int(np.int64(7)),
+        depth_offset_m=float(np.float32(0.1)),
+        axis_deg=None,
+        false_mass=0.0,
+        log_evidence=np.inf,
+        misfit=1.0,
+        variance_m2=2.0,
+        reference_time_s=3.0,
+        query_time_s=4.0,
+    )
+    outcomes = [MatchOutcome(match=found, reason=None)]
+    outcomes += [MatchOutcome(match=None, reason=reason) for reason in NoMatch]
+    read, now_s = to_outcomes(from_outcomes(outcomes, 0.1 + 0.2))
+    assert now_s == 0.1 + 0.2
+    assert [o.reason for o in read] == [o.reason for o in outcomes]
+    assert read[0].match is not None
+    assert read[0].match.log_evidence == np.inf
+    np.testing.assert_array_equal(read[0].match.covariance_m2, found.covariance_m2)
+    np.testing.assert_array_equal(read[0].match.shift_m, found.shift_m)
+
+
+def test_checkpoint_that_cannot_be_read_starts_the_vehicle_anew(tmp_path: Path) -> None:
+    settings = changed(MissionSettings(), SHORT)
+    site = place_survey(open_terrain(None, 1), settings.scenario, 4)
+    follower = simulated_vehicles(settings, site, 4)[1]
+    journal = Journal(tmp_path, Owner(vehicle=1, fingerprint="test"), JournalSettings())
+    journal.start("0x0p+0 0x0p+0 0x0p+0 0x0p+0 0x0p+0")
+    journal.checkpoint(b"\x80\x04cos\nsystem\n.")
+    journal.close()
+    never = Fate(np.random.default_rng(0), 0, 1.0)
+    node = board(settings, follower, never, tmp_path, SensorTape(follower.steps()))
+    assert node.core.boot_epoch == 1
+    assert node.core.status()["store_set_aside"] == 1
+    for k in range(20):
+        node.tick(0.25 * k)
+    assert node.core.reckoned.time_s == 4.75

@@ -8,8 +8,9 @@ from typing import NoReturn
 
 from threadpoolctl import threadpool_limits
 
-from host_tools import config_show, inspector, reproduce, simulate
+from host_tools import compress_files, config_show, inspector, reproduce, simulate
 from host_tools.commands import Command
+from host_tools.emulators import emulate
 from host_tools.processes import channel, demo, vehicle
 from host_tools.replay import gsf
 from protocol.errors import FathomError
@@ -21,6 +22,9 @@ COMMANDS: tuple[Command, ...] = (
     vehicle.FOLLOWER,
     vehicle.LEADER_COMMAND,
     reproduce.COMMAND,
+    compress_files.COMPRESS,
+    compress_files.RECONSTRUCT,
+    emulate.COMMAND,
     gsf.COMMAND,
     inspector.COMMAND,
     config_show.COMMAND,

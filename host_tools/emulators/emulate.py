@@ -1,0 +1,36 @@
+"""`fathomlink emulate`: modems on pseudo-terminals, in real time, until interrupted."""
+
+import argparse
+from functools import partial
+
+from host_tools.commands import Command
+from host_tools.emulators.run import KINDS, EmulationSettings, emulate
+
+
+def _configure(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("kind", choices=KINDS, help="the dialect that the modems speak")
+    parser.add_argument("--nodes", type=int, default=2, help="how many modems")
+    parser.add_argument(
+        "--range", type=float, default=500.0, metavar="M", help="metres between neighbours"
+    )
+    parser.add_argument("--seed", type=int, default=1, help="of loss and noise")
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    emulate(
+        EmulationSettings(
+            kind=arguments.kind,
+            nodes=arguments.nodes,
+            range_m=arguments.range,
+            seed=arguments.seed,
+        ),
+        say=partial(print, flush=True),
+    )
+
+
+COMMAND = Command(
+    name="emulate",
+    help="be Micro-Modems or Nanomodems on ports of this computer",
+    configure=_configure,
+    run=_run,
+)

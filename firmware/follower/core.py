@@ -9,6 +9,7 @@ import numpy as np
 
 from firmware.belief import Belief
 from firmware.compression import Compressed, compress_steps, packets_from
+from firmware.compression.results import PAPER_FRAGMENTS
 from firmware.compression.settings import CompressionSettings
 from firmware.dead_reckoning import DeadReckoning, ReckonedState
 from firmware.follower.correction import DriftCorrection
@@ -204,11 +205,19 @@ class FollowerCore:
         self._outbox.add(packets)
 
     def _slots_left(self, slot_s: float) -> int:
-        """Return how many slots are left, with this one, before the next sub-map is due."""
+        """Return how many slots are left, with this one, before the next sub-map is due.
+
+        A sub-map that is being fitted is due now. Where sub-maps fill the air there is no slot to
+        spare, and none is counted.
+        """
         duration_s = self._settings.submaps.duration_s
+        frames = self._compression.frames if self._settings.profile != "paper" else PAPER_FRAGMENTS
+        if frames >= self._slots.frames_per_submap(duration_s):
+            return 1
         due_s = duration_s * (np.floor(slot_s / duration_s + 1e-9) + 1)
         period_s = self._slots.next_slot_s(self.vehicle, slot_s + 1e-3) - slot_s
-        return max(1, int(np.ceil((due_s - slot_s) / period_s - 1e-9)))
+        slots_left = int(np.ceil((due_s - slot_s) / period_s - 1e-9))
+        return max(1, slots_left - (frames if self._fit is not None else 0))
 
     def _idle_states(self) -> list[ReckonedState]:
         """Return the newest states, once there has been no sub-map for its whole duration."""
@@ -251,10 +260,14 @@ class FollowerCore:
 
 
 def _fitting(settings: FollowerSettings, slots: Slots) -> CompressionSettings:
-    """Return the compression's settings with as many frames as the air has for a sub-map."""
+    """Return the compression's settings with as many frames as the air has for a sub-map.
+
+    Of two or three frames one must do: both of two arrive three times in four.
+    """
     room = max(1, min(slots.frames_per_submap(settings.submaps.duration_s), 15))
     frames = settings.frames_per_submap or min(settings.compression.frames, room)
-    return dataclasses.replace(settings.compression, frames=frames)
+    usable = min(settings.compression.usable_frames, max(1, frames // 2))
+    return dataclasses.replace(settings.compression, frames=frames, usable_frames=usable)
 
 
 def _position(state: ReckonedState) -> Array:

@@ -23,6 +23,7 @@ from firmware.geometry import Array
 from protocol.settings import setting
 
 _CHI_SQUARE_1_99, _CHI_SQUARE_2_999 = 6.6, 13.8  # shares of true innovations that lie below
+_LEAST_NEWS = 0.05  # an answer hardly surer than dead reckoning alone is left out
 _KEPT = 96  # answers and ranges of eight minutes; older ones are in the filter's beginning
 
 
@@ -31,9 +32,13 @@ class CorrectionSettings(DriftSettings):
     """What a follower believes of its dead reckoning, of answers and of ranges."""
 
     answer_sigma_m: float = setting(3.0, "m", "error of an answer that tells none", minimum=0.01)
-    echo_sigma_m: float = setting(
-        4.0, "m", "an answer this near to dead reckoning may be no more than its echo", minimum=0.01
+    first_closures_s: float = setting(
+        600.0, "s", "until then a leader may know no more than dead reckoning", minimum=1.0
     )
+    echo_share: float = setting(
+        0.3, "1", "of what dead reckoning may have run away: what ranges alone tell", minimum=0.01,
+        maximum=1.0,
+    )  # fmt: skip
     sound_speed_mps: float = setting(
         1500.0, "m/s", "mean over the path", minimum=1300.0, maximum=1700.0
     )
@@ -62,6 +67,8 @@ class DriftCorrection:
         self._deployment = self._base = self._filter.deployed(start_time_s)
         self._seen: list[_Filtered] = []
         self._aside: AnswerSeen | None = None
+        self._echo = False  # the newest answer may be dead reckoning again
+        self.empty = 0
         self.accepted = 0
         self.stale = 0
         self.restarted = 0
@@ -86,9 +93,9 @@ class DriftCorrection:
         if time_s < self._base.time_s - 1e-6:
             self.stale += 1
             return False
-        if sigma_m is None:
-            sigma_m = self._untold_sigma_m(time_s, ran_away_m)
-        answer = AnswerSeen(time_s=time_s, ran_away_m=ran_away_m, sigma_m=sigma_m)
+        answer = self._news(time_s, ran_away_m, sigma_m)
+        if answer is None:
+            return False
         self._forget_answer(time_s)
         if self._filter.chi_square(self._state_at(time_s), answer) <= _CHI_SQUARE_2_999:
             self._take(answer)
@@ -131,7 +138,10 @@ class DriftCorrection:
         """Return the believed position (2,) at the time, and its covariance (2, 2)."""
         newest = self._seen[-1].state if self._seen else self._base
         state = self._filter.predicted(newest, max(time_s, newest.time_s))
-        return np.asarray(reckoned_m - state.mean[:2]), state.covariance[:2, :2]
+        covariance_m2 = state.covariance[:2, :2]
+        if self._echo:
+            covariance_m2 = covariance_m2 + self._alone_m2(time_s) * np.eye(2)
+        return np.asarray(reckoned_m - state.mean[:2]), covariance_m2
 
     def _state_at(self, time_s: float) -> DriftState:
         """Return the state after all that was seen up to the time."""
@@ -161,23 +171,48 @@ class DriftCorrection:
             state = self._filter.updated(state, one)
             self._seen.append(_Filtered(one=one, state=state))
 
-    def _untold_sigma_m(self, time_s: float, ran_away_m: Array) -> float:
-        """Return the sigma of an answer that tells none.
+    def _news(self, time_s: float, ran_away_m: Array, sigma_m: float | None) -> AnswerSeen | None:
+        """Return what an answer says beyond our own dead reckoning, or None if nothing.
 
-        Before its first closures a leader knows no more than the dead reckoning that it was told,
-        and answers with that. An answer so near to dead reckoning is either such an echo, as
-        uncertain as dead reckoning itself, or a true position of a vehicle that hardly drifted:
-        the variance is the mean of the two, weighted by how likely each is.
+        A leader's estimate holds what any vehicle of this kind may drift, as this filter does;
+        that part is divided out of a variance that is told, lest it counts twice.
+        """
+        alone_m2 = self._alone_m2(time_s)
+        if sigma_m is None:
+            self._echo = self._is_echo(time_s, ran_away_m, alone_m2)
+            sigma_m = self._settings.answer_sigma_m
+            return AnswerSeen(time_s=time_s, ran_away_m=ran_away_m, sigma_m=sigma_m)
+        kept = 1.0 - sigma_m**2 / alone_m2
+        if kept < _LEAST_NEWS:
+            self.empty += 1
+            return None
+        return AnswerSeen(
+            time_s=time_s, ran_away_m=ran_away_m / kept, sigma_m=sigma_m / float(np.sqrt(kept))
+        )
+
+    def _alone_m2(self, time_s: float) -> float:
+        """Return the variance of dead reckoning that nobody corrects, along one axis."""
+        at_s = max(time_s, self._deployment.time_s)
+        return float(self._filter.predicted(self._deployment, at_s).covariance[0, 0])
+
+    def _is_echo(self, time_s: float, ran_away_m: Array, alone_m2: float) -> bool:
+        """Return whether an answer that tells no variance may be our dead reckoning again.
+
+        Before its first closures a leader knows little more than the dead reckoning that it was
+        told, and answers with that. An answer near to dead reckoning is either such an echo, or
+        the position of a vehicle that hardly drifted; the likelier by then is believed.
         """
         s = self._settings
-        alone_m2 = float(self._filter.predicted(self._deployment, time_s).covariance[0, 0])
-        missed_m2 = float(ran_away_m @ ran_away_m)
-        densities = [
-            np.exp(-0.5 * missed_m2 / variance_m2) / variance_m2
-            for variance_m2 in (s.echo_sigma_m**2, alone_m2 + s.answer_sigma_m**2)
-        ]
-        echo = densities[0] / max(sum(densities), 1e-300)
-        return float(np.sqrt(echo * alone_m2 + s.answer_sigma_m**2))
+        early = float(np.exp(-max(time_s - self._deployment.time_s, 0.0) / s.first_closures_s))
+        missed_m2, noise_m2 = float(ran_away_m @ ran_away_m), s.answer_sigma_m**2
+        echo, position = (
+            share * np.exp(-0.5 * missed_m2 / variance_m2) / variance_m2
+            for share, variance_m2 in (
+                (early, noise_m2 + s.echo_share**2 * alone_m2),
+                (1.0 - early, noise_m2 + alone_m2),
+            )
+        )
+        return bool(echo > position)
 
     def _confirmed(self, answer: AnswerSeen) -> bool:
         """Start over from the deployment with an answer that agrees with the one put aside."""

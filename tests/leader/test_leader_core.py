@@ -21,7 +21,7 @@ from tests.leader.vessels import Convoy, convoy, follower_of, leader_of, line, s
 
 def frames_of(**changes: object) -> list[tuple[bytes, float]]:
     """Return what a follower transmits in 100 s, and when."""
-    one = convoy(lose=lambda packet, time_s: True, **changes).run(0.0, 100.0)
+    one = convoy(lose=lambda *_: True, **changes).run(0.0, 100.0)
     return [(encode(packet), sent_s) for packet, sent_s in one.up]
 
 
@@ -78,14 +78,15 @@ def test_every_profile_is_carried_from_sonar_to_answer(profile: str, answers: st
     one = convoy(answers=answers, profile=profile).run(0.0, 100.0)
     assert len(sheets_of(one.leader)) >= 2
     kind = ExtendedAnswer if answers == "extended" else Answer
-    assert one.down and all(isinstance(packet, kind) for packet, _ in one.down)
+    assert one.down
+    assert all(isinstance(packet, kind) for packet, _ in one.down)
     follower, _ = one.followers[1]
     assert follower.status()["answers_used"] >= 3
     assert not follower.status().get("submaps_unfit")
 
 
 def test_four_followers_have_each_a_chain_and_a_turn() -> None:
-    four = convoy(4, profile="lattice", **{"compression.usable_frames": 1}).run(0.0, 200.0)
+    four = convoy(4, profile="lattice").run(0.0, 200.0)
     assert four.leader.vehicles() == [0, 1, 2, 3, 4]
     turns = [packet.header.fragment for packet, _ in four.down]
     assert {turns.count(v) for v in (1, 2, 3, 4)} <= {

@@ -1,19 +1,19 @@
 """`fathomlink follower` and `fathomlink leader`: one vehicle, its loop on its modem's port."""
 
 import argparse
+import dataclasses
 import datetime
 import itertools
 import math
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from firmware.clock import WallClock
-from firmware.dead_reckoning import DeadReckoning, ReckonedState
 from firmware.follower.core import FollowerCore
 from firmware.follower.loop import FollowerLoop
 from firmware.leader.core import LeaderCore
@@ -25,13 +25,22 @@ from host_tools.commands import Command
 from host_tools.mapping import DepthMap
 from host_tools.mission import deployed
 from host_tools.processes.records import VehicleFiles
+from host_tools.processes.resume import (
+    Journaled,
+    SilentModem,
+    missed_instants,
+    navigated,
+    open_core,
+    plain_core,
+    prepare_store,
+    steps_since,
+)
 from host_tools.processes.served_clock import ServedClock, StampedModem
 from host_tools.processes.voyage import Voyage, add_voyage_arguments, voyage_of
 from host_tools.simulator.vehicle import SimulatedVehicle
 from protocol.errors import ConfigError
 from protocol.modems.base import Modem
 from protocol.modems.registry import open_modem
-from protocol.schedule import Slots
 
 LEADER = 0
 BOOT_EPOCHS = 16
@@ -51,9 +60,17 @@ class Aboard:
 
 
 def run_vehicle(
-    vehicle: int, modem_url: str, clock_url: str, voyage: Voyage, out: Path | None, start: str
+    vehicle: int,
+    modem_url: str,
+    clock_url: str,
+    voyage: Voyage,
+    out: Path | None,
+    start: str,
+    store: Path | None = None,
 ) -> None:
     """Run one vehicle from its clock's first tick to its last, and write its files."""
+    if store is not None:
+        prepare_store(store)
     files = None if out is None else VehicleFiles(out, vehicle)
     starts = 0 if files is None else files.prepare()
     modem, clock = _modem_and_clock(vehicle, modem_url, clock_url, voyage, start)
@@ -62,9 +79,11 @@ def run_vehicle(
         first_s = next(ticks, None)
         if first_s is None:
             return
-        aboard = _board(vehicle, starts, modem, clock, voyage, files, first_s)
+        aboard = _board(vehicle, starts, modem, clock, voyage, files, first_s, store)
         _sail(aboard, itertools.chain([first_s], ticks), on_wall=isinstance(clock, WallClock))
         aboard.worker.close()
+        if isinstance(aboard.loop.core, Journaled):
+            aboard.loop.core.recorder.journal.close()
         _write(aboard, voyage)
         if isinstance(clock, ServedClock):
             clock.end()
@@ -99,40 +118,64 @@ def _board(
     voyage: Voyage,
     files: VehicleFiles | None,
     first_s: float,
+    store: Path | None,
 ) -> Aboard:
     """Return the vehicle with core, loop and sensors as of its first tick."""
-    settings, truth_map = voyage.settings, DepthMap(voyage.site.window)
+    truth_map = DepthMap(voyage.site.window)
     simulated = SimulatedVehicle(
-        settings.scenario, voyage.site.seabed, vehicle, voyage.seed, truth_map.add
+        voyage.settings.scenario, voyage.site.seabed, vehicle, voyage.seed, truth_map.add
     )
-    steps: Iterator[SensorStep] = simulated.steps()
-    start, steps = _navigated(deployed(simulated), steps, first_s)
-    slots, epoch = Slots(settings.slots), starts % BOOT_EPOCHS
+    start, passed, steps = navigated(deployed(simulated), simulated.steps(), first_s)
+    core = (
+        plain_core(vehicle, starts % BOOT_EPOCHS, start, voyage)
+        if store is None
+        else open_core(vehicle, store, start, voyage, first_s)
+    )
     in_real_time = isinstance(clock, WallClock) or clock.in_real_time
     worker: Worker = ThreadWorker() if in_real_time else InlineWorker()
-    loop: FollowerLoop | LeaderLoop
-    if vehicle == LEADER:
-        leader = LeaderCore(epoch, start, settings=settings.leader, slots=slots)
-        loop = LeaderLoop(leader, modem, steps, worker, clock.now_s, voyage.tick_s)
-    else:
-        follower = FollowerCore(vehicle, epoch, start, settings=settings.follower, slots=slots)
-        loop = FollowerLoop(follower, modem, steps, clock.now_s, voyage.tick_s)
-    return Aboard(loop=loop, worker=worker, voyage=voyage, truth_map=truth_map, files=files)
+    loop = _loop(core, modem, steps, worker, clock.now_s, voyage.tick_s)
+    aboard = Aboard(loop=loop, worker=worker, voyage=voyage, truth_map=truth_map, files=files)
+    if isinstance(core, Journaled):
+        _catch_up(aboard, core, passed, first_s, in_real_time=in_real_time)
+    return aboard
 
 
-def _navigated(
-    start: ReckonedState, steps: Iterator[SensorStep], first_s: float
-) -> tuple[ReckonedState, Iterator[SensorStep]]:
-    """Return dead reckoning just before the first tick, and the steps from then on.
+def _loop(
+    core: LeaderCore | FollowerCore,
+    modem: Modem,
+    steps: Iterator[SensorStep],
+    worker: Worker,
+    stopwatch: Callable[[], float],
+    period_s: float,
+) -> LeaderLoop | FollowerLoop:
+    if isinstance(core, LeaderCore):
+        return LeaderLoop(core, modem, steps, worker, stopwatch, period_s)
+    return FollowerLoop(core, modem, steps, stopwatch, period_s)
 
-    The inertial navigation is a unit of its own: it goes on while the computer restarts.
+
+def _catch_up(
+    aboard: Aboard,
+    core: Journaled,
+    passed: list[SensorStep],
+    first_s: float,
+    *,
+    in_real_time: bool,
+) -> None:
+    """Take what the store lacks; in virtual time live it again, in real time only navigate it.
+
+    The last instant that the store holds is noted again: its belief may have come after it.
     """
-    reckoning = DeadReckoning(start)
-    for step in steps:
-        if step[0].time_s >= first_s - 1e-6:
-            return reckoning.state, itertools.chain([step], steps)
-        reckoning.receive_odometry(step[0])
-    return reckoning.state, steps
+    if in_real_time:
+        for odometry, _ in steps_since(core, passed, pings=False):
+            core.receive_odometry(odometry)
+        return
+    tick_s, last_s = aboard.voyage.tick_s, core.recorder.last_tick_s
+    missed, steps = missed_instants(core, first_s, tick_s), steps_since(core, passed, pings=True)
+    is_whole = core.recorder.unfinished_from_s(tick_s) > last_s and last_s == math.floor(last_s)
+    if is_whole and aboard.files is not None:
+        aboard.files.note(core.belief(), core.reckoned)
+    silent = _loop(core, SilentModem(), steps, aboard.worker, lambda: 0.0, tick_s)
+    _sail(dataclasses.replace(aboard, loop=silent), iter(missed), on_wall=False)
 
 
 def _modem_and_clock(
@@ -199,6 +242,9 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         "--start", default="next", metavar="UTC", help="with the wall clock; default: next minute"
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="where the vehicle's files go")
+    parser.add_argument(
+        "--store", type=Path, metavar="DIR", help="what a restart resumes from; default: none"
+    )
     add_voyage_arguments(parser)
 
 
@@ -222,7 +268,8 @@ def _run_leader(arguments: argparse.Namespace) -> None:
 
 
 def _run(vehicle: int, arguments: argparse.Namespace, voyage: Voyage) -> None:
-    run_vehicle(vehicle, arguments.modem, arguments.clock, voyage, arguments.out, arguments.start)
+    a = arguments
+    run_vehicle(vehicle, a.modem, a.clock, voyage, a.out, a.start, a.store)
 
 
 FOLLOWER = Command(

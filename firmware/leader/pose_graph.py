@@ -51,10 +51,10 @@ class GraphSettings(Settings):
         0.2, "m/sqrt(s)", "random part of dead reckoning: variance 0.04 a second", minimum=1e-4
     )
     bias_sigma_mps: float = setting(
-        0.15, "m/s", "unmeasured current at the start, each axis", minimum=1e-4
+        0.2, "m/s", "unmeasured current at the start, each axis", minimum=1e-4
     )
     bias_difference_mps: float = setting(
-        0.1, "m/s", "vehicles drift in the same water: their biases differ by less", minimum=1e-4
+        0.2, "m/s", "vehicles drift in the same water: their biases differ by less", minimum=1e-4
     )
     bias_walk: float = setting(
         0.002, "m/s/sqrt(s)", "lets a current of 0.2 m/s turn within an hour", minimum=1e-7
@@ -378,8 +378,9 @@ class PoseGraph:
 
     def _factorisation(self) -> tuple[SuperLU, dict[int, int]]:
         """Return the factorised information matrix, and the first column of every variable."""
-        if self._factorised is None:
+        if self._changed or self._fresh.size():
             self.update()
+        if self._factorised is None:
             linear = self._isam.getFactorsUnsafe().linearize(self._values)
             rows, columns, entries = linear.sparseJacobian_()
             keys = sorted(self._values.keys())

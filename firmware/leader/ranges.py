@@ -1,11 +1,11 @@
 """Which of a window of one-way ranges to believe, when some are stretched by a common factor.
 
 Within the 40 s of one transfer the two vehicles' relative motion is known far better than their
-relative position. All true ranges therefore miss the prediction by the same amount, while a
+relative position. All true ranges therefore miss the prediction by nearly the same amount, while a
 stretched one (Eq. 14) misses by a tenth of the range more. The window is explained as a whole: the
-common miss is found under a mixture of true, stretched and wild ranges, and nothing is believed
-when two explanations compete. The share of stretched ranges is learned over the mission, so that
-20 % and 80 % are the same problem.
+common miss and its rate are found under a mixture of true, stretched and wild ranges, and nothing
+is believed when two explanations compete. The share of stretched ranges is learned over the
+mission, so that 20 % and 80 % are the same problem.
 """
 
 from dataclasses import dataclass
@@ -18,6 +18,7 @@ from protocol.settings import Settings, setting
 
 _WILD_DENSITY = 1e-4  # per metre: multipath from anywhere in the water column
 _GRID_STEP_SIGMAS = 0.5
+_LONGEST_GRID = 1000  # half-widths: a kilometre of miss at the usual sigma
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,6 +38,9 @@ class RangeSettings(Settings):
     )
     window_spread_m: float = setting(
         1.3, "m", "relative dead reckoning over one window", minimum=0.0
+    )
+    rate_sigma_mps: float = setting(
+        0.15, "m/s", "relative drift along the line of sight that is not known yet", minimum=1e-3
     )
     shortest_m: float = setting(5.0, "m", "nearer, the direction says nothing", minimum=0.0)
     longest_m: float = setting(
@@ -72,40 +76,55 @@ class RangeJudge:
         """The share of stretched ranges, as learned so far."""
         return self._seen["stretched"] / sum(self._seen.values())
 
-    def judge(self, measured_m: Array, predicted_m: Array, prior_sigma_m: float) -> RangeVerdict:
-        """Explain measured (R,) by predicted ranges (R,) whose common error has the prior sigma."""
+    def judge(
+        self, measured_m: Array, predicted_m: Array, time_s: Array, prior_sigma_m: float
+    ) -> RangeVerdict:
+        """Explain measured (R,) by predicted ranges (R,) at their times (R,).
+
+        The prediction misses by a common amount, whose sigma is prior_sigma_m, and by a rate,
+        because the vehicles' drift may not be known yet.
+        """
         s = self._settings
         sigma_m = float(np.hypot(s.sigma_m, s.window_spread_m))
         sane = np.isfinite(measured_m) & (measured_m >= s.shortest_m) & (measured_m <= s.longest_m)
-        reach_m = 4.0 * prior_sigma_m + 4.0 * sigma_m
-        steps = int(min(np.ceil(reach_m / (_GRID_STEP_SIGMAS * sigma_m)), 2000))
-        miss_m = np.linspace(-reach_m, reach_m, 2 * steps + 1)
         if not np.any(sane):
             return RangeVerdict(true=sane & False, stretched=sane & False, certain=False)
+        age_s = time_s - np.mean(time_s[sane])
+        miss_m = _grid(4.0 * prior_sigma_m + 4.0 * sigma_m, sigma_m)
+        reach_s = max(float(np.max(np.abs(age_s))), 1e-3)
+        rate_mps = _grid(3.0 * s.rate_sigma_mps, sigma_m / reach_s)
         as_true, as_stretched = self._densities(
-            np.where(sane, measured_m, np.nan), predicted_m, miss_m, sigma_m
+            np.where(sane, measured_m, np.nan)[:, None, None],
+            predicted_m[:, None, None] + miss_m[:, None] + age_s[:, None, None] * rate_mps,
+            sigma_m,
         )
         total = as_true + as_stretched + _WILD_DENSITY
-        score = np.sum(np.log(total[sane]), axis=0) - 0.5 * (miss_m / prior_sigma_m) ** 2
+        prior = (miss_m / prior_sigma_m)[:, None] ** 2 + (rate_mps / s.rate_sigma_mps) ** 2
+        score = np.sum(np.log(total[sane]), axis=0) - 0.5 * prior
         belief = np.exp(score - score.max())
-        best = int(np.argmax(score))
-        near = np.abs(miss_m - miss_m[best]) <= 3.0 * sigma_m
+        i, j = divmod(int(np.argmax(score)), score.shape[1])
+        near = np.abs(miss_m - miss_m[i]) <= 3.0 * sigma_m
         certain = bool(belief[near].sum() / belief.sum() >= s.certainty)
-        odds = total[:, best]
-        true = sane & (as_true[:, best] > 0.9 * odds)
-        stretched = sane & (as_stretched[:, best] > 0.9 * odds)
+        odds = total[:, i, j]
+        true = sane & (as_true[:, i, j] > 0.9 * odds)
+        stretched = sane & (as_stretched[:, i, j] > 0.9 * odds)
         if certain:
             self._seen["true"] += float(np.count_nonzero(true))
             self._seen["stretched"] += float(np.count_nonzero(stretched))
         return RangeVerdict(true=true, stretched=stretched, certain=certain)
 
     def _densities(
-        self, measured_m: Array, predicted_m: Array, miss_m: Array, sigma_m: float
+        self, measured_m: Array, expected_m: Array, sigma_m: float
     ) -> tuple[Array, Array]:
-        """Return the weighted densities (R, G) of each range being true, and being stretched."""
+        """Return the weighted densities (R, G, V) of each range being true, and being stretched."""
         share, factor = self.stretched_share, self._settings.outlier_factor
-        expected_m = predicted_m[:, None] + miss_m[None, :]
         scale = 1.0 / (np.sqrt(2 * np.pi) * sigma_m)
-        true = np.exp(-0.5 * ((measured_m[:, None] - expected_m) / sigma_m) ** 2)
-        stretched = np.exp(-0.5 * ((measured_m[:, None] - factor * expected_m) / sigma_m) ** 2)
+        true = np.exp(-0.5 * ((measured_m - expected_m) / sigma_m) ** 2)
+        stretched = np.exp(-0.5 * ((measured_m - factor * expected_m) / sigma_m) ** 2)
         return (1 - share) * scale * true, share * scale * stretched
+
+
+def _grid(reach: float, sigma: float) -> Array:
+    """Return values from -reach to reach, half a sigma apart, zero among them, bounded."""
+    steps = int(min(np.ceil(reach / (_GRID_STEP_SIGMAS * sigma)), _LONGEST_GRID))
+    return np.linspace(-reach, reach, 2 * steps + 1)

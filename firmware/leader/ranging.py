@@ -86,6 +86,7 @@ class Ranging:
         verdict = self._judge.judge(
             np.array([p.range_m for p in placed]),
             np.array([p.predicted_m for p in placed]),
+            np.array([p.there.time_s for p in placed]),
             float(np.sqrt(max(variance_m2, 1e-6))),
         )
         if not verdict.certain:

@@ -2,18 +2,22 @@
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from firmware.geometry import Array
 from firmware.leader.ranges import RangeJudge, RangeSettings
+
+TIMES_S = np.linspace(0.0, 36.0, 10)
 
 
 def window(
     rng: np.random.Generator, share: float, miss_m: float, size: int = 10
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Return measured, predicted and whether stretched."""
     true_m = rng.uniform(200, 600) + np.arange(size)
     stretched = rng.random(size) < share
-    measured_m = np.where(stretched, 1.1, 1.0) * true_m + rng.standard_normal(size)
-    return measured_m, true_m - miss_m, stretched
+    measured_m: Array = np.where(stretched, 1.1, 1.0) * true_m + rng.standard_normal(size)
+    return measured_m, np.asarray(true_m - miss_m, dtype=np.float64), stretched
 
 
 @pytest.mark.parametrize("share", [0.2, 0.8])
@@ -22,7 +26,7 @@ def test_stretched_ranges_are_told_apart_under_both_readings_of_eq_14(share: flo
     right = total = 0
     for _ in range(60):
         measured_m, predicted_m, stretched = window(rng, share, rng.normal(0, 5))
-        verdict = judge.judge(measured_m, predicted_m, 5.0)
+        verdict = judge.judge(measured_m, predicted_m, TIMES_S, 5.0)
         if verdict.certain:
             used = verdict.true | verdict.stretched
             right += int(np.sum(verdict.stretched[used] == stretched[used]))
@@ -32,23 +36,33 @@ def test_stretched_ranges_are_told_apart_under_both_readings_of_eq_14(share: flo
     assert judge.stretched_share == pytest.approx(share, abs=0.06)
 
 
+def test_drift_within_the_window_does_not_hide_what_is_stretched() -> None:
+    rng, judge = np.random.default_rng(9), RangeJudge(RangeSettings())
+    measured_m, predicted_m, stretched = window(rng, 0.2, 30.0)
+    verdict = judge.judge(measured_m, predicted_m - 0.3 * TIMES_S, TIMES_S, 40.0)
+    assert verdict.certain
+    assert verdict.stretched.tolist() == stretched.tolist()
+
+
 def test_window_with_two_equal_explanations_is_left_undecided() -> None:
     judge = RangeJudge(RangeSettings())
     true_m = np.full(6, 300.0)
     measured_m = np.where(np.arange(6) % 2 == 0, 1.1, 1.0) * true_m
     lonely_m = np.array([330.0])
-    assert not judge.judge(lonely_m, np.array([315.0]), 60.0).certain
-    assert judge.judge(measured_m, true_m, 2.0).certain
+    assert not judge.judge(lonely_m, np.array([315.0]), TIMES_S[:1], 60.0).certain
+    assert judge.judge(measured_m, true_m, TIMES_S[:6], 2.0).certain
 
 
 @pytest.mark.parametrize("bad_m", [0.0, -3.0, 100_000.0, np.nan, np.inf])
 def test_impossible_range_is_neither_true_nor_stretched(bad_m: float) -> None:
     measured_m = np.array([300.0, bad_m, 301.0, 299.5])
-    verdict = RangeJudge(RangeSettings()).judge(measured_m, np.full(4, 300.0), 3.0)
+    verdict = RangeJudge(RangeSettings()).judge(measured_m, np.full(4, 300.0), TIMES_S[:4], 3.0)
     assert verdict.true.tolist() == [True, False, True, True]
     assert not verdict.stretched.any()
 
 
 def test_window_of_impossible_ranges_alone_is_not_certain() -> None:
-    verdict = RangeJudge(RangeSettings()).judge(np.full(3, np.nan), np.full(3, 300.0), 3.0)
+    verdict = RangeJudge(RangeSettings()).judge(
+        np.full(3, np.nan), np.full(3, 300.0), TIMES_S[:3], 3.0
+    )
     assert not verdict.certain

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Mapping
+from pathlib import Path
 
 import numpy as np
 
@@ -13,7 +14,9 @@ from host_tools.mission_settings import MissionSettings
 from host_tools.nodes import FollowerNode, LeaderNode, Node
 from host_tools.simulator.placement import Site
 from host_tools.simulator.vehicle import SimulatedVehicle
+from host_tools.stored_nodes import stored_nodes
 from protocol.acoustics import Delivery, Water
+from protocol.errors import ConfigError
 from protocol.schedule import Slots
 
 _WATER_STREAM = 0x57A7E2  # keeps the water's draws apart from the vehicles'
@@ -45,9 +48,22 @@ def water_between(settings: MissionSettings, vehicles: list[SimulatedVehicle], s
 
 
 def local_nodes(
-    settings: MissionSettings, vehicles: list[SimulatedVehicle], baseline: str = "none"
+    settings: MissionSettings,
+    vehicles: list[SimulatedVehicle],
+    baseline: str = "none",
+    store: Path | None = None,
 ) -> tuple[LeaderNode, list[FollowerNode]]:
-    """Return every vehicle with its core, in this process."""
+    """Return every vehicle with its core, in this process; with stores in a new folder, if given.
+
+    Raises
+    ------
+    ConfigError
+        For a store beside a baseline, which has no packets to keep, or one that is there already.
+    """
+    if store is not None:
+        if baseline != "none":
+            raise ConfigError(f"--store is for vehicles; --baseline {baseline} is none")
+        return stored_nodes(settings, vehicles, [deployed(v) for v in vehicles], store)
     slots = Slots(settings.slots)
     originals = Originals(submaps={})
     rebuild = rebuild_of(baseline, originals, settings.leader.cell_m)

@@ -17,6 +17,7 @@ from host_tools.report import write_report
 from host_tools.results import MissionResult
 from host_tools.simulator.placement import place_survey
 from host_tools.simulator.terrain import open_terrain
+from host_tools.stored_nodes import close_stores
 from host_tools.writers import prepare_folder, write_outputs
 from protocol.acoustics import Delivery
 
@@ -27,13 +28,14 @@ def simulate(
     seed: int,
     baseline: str = "none",
     progress: Progress | None = None,
+    store: Path | None = None,
 ) -> MissionResult:
-    """Return a whole mission, all vehicles in this process."""
+    """Return a whole mission, all vehicles in this process; they keep stores if asked to."""
     scenario = settings.scenario
     site = place_survey(open_terrain(terrain, scenario.relief_seed), scenario, seed)
     truth_map = DepthMap(site.window)
     vehicles = simulated_vehicles(settings, site, seed, truth_map.add)
-    leader, followers = local_nodes(settings, vehicles, baseline)
+    leader, followers = local_nodes(settings, vehicles, baseline, store)
     deliveries: list[Delivery] = []
     run(
         {0: leader, **{node.core.vehicle: node for node in followers}},
@@ -43,6 +45,7 @@ def simulate(
         record=deliveries.append,
         progress=progress,
     )
+    close_stores([leader, *followers])
     return mission_result(
         settings, site, seed, baseline, vehicles, leader, followers, deliveries, truth_map
     )
@@ -72,6 +75,9 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="where the outputs go"
     )
+    parser.add_argument(
+        "--store", type=Path, metavar="DIR", help="where vehicles keep their stores; default: none"
+    )
     parser.add_argument("--no-report", action="store_true", help="leave report.html out")
 
 
@@ -93,6 +99,7 @@ def _run(arguments: argparse.Namespace) -> None:
             arguments.seed,
             arguments.baseline,
             lambda now_s: _advance(bar, now_s),
+            arguments.store,
         )
     evaluation = evaluate(result)
     write_outputs(result, evaluation, folder)

@@ -7,13 +7,16 @@ from typing import Any
 
 from firmware.journal import StoreUnusableError
 
-_ROOMS = ("firmware.", "protocol.", "numpy.")
+_ROOMS = ("firmware.", "protocol.")
 _OTHERS = {
     ("collections", "deque"),
     ("collections", "Counter"),
     ("collections", "OrderedDict"),
     ("numpy", "ndarray"),
     ("numpy", "dtype"),
+    ("numpy._core.multiarray", "_reconstruct"),
+    ("numpy._core.multiarray", "scalar"),
+    ("numpy._core.numeric", "_frombuffer"),
 }
 
 
@@ -51,9 +54,13 @@ def read(body: bytes) -> tuple[dict[str, Any], tuple[Any, ...]]:
 
 
 class _Reader(pickle.Unpickler):
-    """Reads classes of ours and of numpy; nothing else can be named in a checkpoint."""
+    """Reads our own classes and numpy's arrays; nothing else can be named in a checkpoint."""
 
     def find_class(self, module: str, name: str) -> Any:  # noqa: ANN401
-        if (module, name) in _OTHERS or f"{module}.".startswith(_ROOMS):
+        if (module, name) in _OTHERS:
             return super().find_class(module, name)
+        if module.startswith(_ROOMS) and "." not in name:
+            found = super().find_class(module, name)
+            if isinstance(found, type) and found.__module__ == module:
+                return found
         raise pickle.UnpicklingError(f"{module}.{name} has no place in a checkpoint")

@@ -20,8 +20,8 @@ from host_tools.simulator.vehicle import SimulatedVehicle
 from protocol.acoustics import Delivery
 from protocol.schedule import Slots
 
-SHORT = {"duration_min": 3.0, "follower_duration_min": 2.5, "leg_m": 60.0, "beams": 32}
-KILLS = 10
+SHORT = {"duration_min": 2.2, "follower_duration_min": 2.0, "leg_m": 60.0, "beams": 32}
+KILLS = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,7 +39,7 @@ def mission(folder: Path, kills: int, seed: int = 4) -> Told:
     site = place_survey(open_terrain(None, 1), settings.scenario, seed)
     vehicles = simulated_vehicles(settings, site, seed)
     fates = [
-        Fate(np.random.default_rng([seed, v.index]), kills, 2000.0 / max(kills, 1))
+        Fate(np.random.default_rng([seed, v.index]), kills, 1500.0 / max(kills, 1))
         for v in vehicles
     ]
     nodes = {
@@ -52,7 +52,7 @@ def mission(folder: Path, kills: int, seed: int = 4) -> Told:
     }
     deliveries: list[Delivery] = []
     water = water_between(settings, vehicles, seed)
-    run(nodes, water, duration_s=180.0, tick_s=0.25, record=deliveries.append)
+    run(nodes, water, duration_s=132.0, tick_s=0.25, record=deliveries.append)
     leader = nodes[0].core
     assert isinstance(leader, JournaledLeader)
     return Told(
@@ -95,7 +95,7 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> Told:
 def test_kills_change_no_frame_no_belief_and_no_estimate(undisturbed: Told, killed: Told) -> None:
     assert undisturbed.kills == 0
     assert killed.kills == 2 * KILLS
-    assert len(killed.deliveries) > 30
+    assert len(killed.deliveries) > 15
     assert killed.deliveries == undisturbed.deliveries
     for ours, theirs in zip(killed.beliefs, undisturbed.beliefs, strict=True):
         np.testing.assert_array_equal(ours, theirs)
@@ -116,7 +116,7 @@ def test_nothing_is_sent_while_catching_up_nor_told_differently(killed: Told) ->
 
 def test_follower_writes_itself_down_so_that_its_store_stays_small(undisturbed: Told) -> None:
     journal = undisturbed.nodes[1].core.recorder.journal
-    assert journal.counters["store_checkpoints"] >= 4
+    assert journal.counters["store_checkpoints"] >= 3
     assert journal.counters["store_set_aside"] == 0
 
 

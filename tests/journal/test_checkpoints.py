@@ -1,0 +1,104 @@
+import pickle
+from collections import Counter, OrderedDict, deque
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware.checkpoints import NotNowError, read, written
+from firmware.follower.journaled import JournaledFollower
+from firmware.journal import Journal, JournalSettings, Owner, StoreUnusableError
+from host_tools.mission import deployed, simulated_vehicles
+from host_tools.mission_settings import MissionSettings, changed
+from host_tools.simulator.placement import place_survey
+from host_tools.simulator.terrain import open_terrain
+from protocol.packets import Profile
+from protocol.schedule import Slots
+
+
+def test_plain_values_read_back() -> None:
+    state = {
+        "array": np.arange(6.0).reshape(2, 3).T,
+        "small": np.float64(0.1),
+        "odd": np.array([], dtype=np.float32),
+        "queue": deque([1, 2], maxlen=2),
+        "counter": Counter(a=1),
+        "ordered": OrderedDict(b=2),
+        "enum": Profile.TRAJECTORY,
+    }
+    back, marks = read(written(state, (1.0, None)))
+    assert marks == (1.0, None)
+    np.testing.assert_array_equal(back.pop("array"), state.pop("array"))
+    np.testing.assert_array_equal(back.pop("odd"), state.pop("odd"))
+    assert back == state
+
+
+def test_work_in_progress_is_not_now() -> None:
+    with pytest.raises(NotNowError):
+        written({"fit": (k for k in range(3))}, ())
+
+
+class Call:
+    def __init__(self, module: str, name: str) -> None:
+        self.module, self.name = module, name
+
+    def bytes(self) -> bytes:
+        """Return a pickle that would call a function of a module with one text."""
+        text = [self.module, self.name, "true"]
+        body = b"".join(b"\x8c" + bytes([len(t)]) + t.encode() for t in text[:2])
+        return b"\x80\x04" + body + b"\x93" + b"\x8c\x04true\x85R."
+
+
+@pytest.mark.parametrize(
+    ("module", "name"),
+    [
+        ("os", "system"),
+        ("builtins", "eval"),
+        ("firmware.journal", "os.system"),
+        ("firmware.journal", "sqlite3.connect"),
+        ("firmware.journal", "_set_aside"),
+        ("numpy.testing", "runstring"),
+        ("protocol.nowhere", "Thing"),
+    ],
+)
+def test_checkpoint_can_call_nothing(module: str, name: str) -> None:
+    with pytest.raises(StoreUnusableError, match="cannot be read"):
+        read(Call(module, name).bytes())
+
+
+@pytest.mark.parametrize("junk", [b"", b"\x80", pickle.dumps(3), pickle.dumps((1, 2, 3))])
+def test_junk_is_no_checkpoint(junk: bytes) -> None:
+    with pytest.raises(StoreUnusableError):
+        read(junk)
+
+
+@pytest.mark.parametrize("profile", ["paper", "dense", "lattice"])
+def test_follower_of_every_profile_resumes_from_its_checkpoint(
+    tmp_path: Path, profile: str
+) -> None:
+    changes = {"duration_min": 2.0, "follower_duration_min": 2.0, "leg_m": 60.0, "beams": 24}
+    settings = changed(MissionSettings(), {**changes, "follower.profile": profile})
+    site = place_survey(open_terrain(None, 1), settings.scenario, 4)
+    vehicle = simulated_vehicles(settings, site, 4)[1]
+
+    def follower() -> JournaledFollower:
+        journal = Journal(tmp_path, Owner(vehicle=1, fingerprint=""), JournalSettings())
+        slots, start = Slots(settings.slots), deployed(vehicle)
+        return JournaledFollower(journal, 1, start, settings=settings.follower, slots=slots)
+
+    core = follower()
+    for odometry, ping in vehicle.steps():
+        if odometry.time_s > 75.0:
+            break
+        core.receive_odometry(odometry)
+        if ping is not None:
+            core.receive_ping(ping)
+        core.tick(odometry.time_s)
+        core.poll(odometry.time_s)
+    core.recorder.journal.close()
+    assert core.recorder.journal.counters["store_checkpoints"] == 1
+    again = follower()
+    later_s = np.arange(75.25, 120.0, 0.25)
+    assert [again.poll(t) for t in later_s] == [core.poll(t) for t in later_s]
+    assert again.counters == core.counters
+    assert again.belief().position_m.tolist() == core.belief().position_m.tolist()

@@ -14,6 +14,7 @@ from firmware.leader.ledger import (
     RangeRecord,
     Record,
     SharedDriftRecord,
+    SharedWalkRecord,
 )
 
 _QUARTER_TURN = np.array([[0.0, -1.0], [1.0, 0.0]])
@@ -23,7 +24,9 @@ _NOTHING_SAID = 1e8  # (m/s)^2: ten kilometres a second of bias is no statement
 _Jacobians = list[Array] | None
 
 
-def factor_of(record: Record, robust_kernel: float) -> gtsam.NonlinearFactor:
+def factor_of(  # noqa: PLR0911
+    record: Record, robust_kernel: float
+) -> gtsam.NonlinearFactor:
     """Return the factor that gtsam makes of a record; closures and ranges are robust."""
     match record:
         case PriorRecord():
@@ -33,6 +36,8 @@ def factor_of(record: Record, robust_kernel: float) -> gtsam.NonlinearFactor:
             return _odometry(record)
         case SharedDriftRecord():
             return _shared_drift(record)
+        case SharedWalkRecord():
+            return _shared_walk(record)
         case ClosureRecord():
             return _closure(record, robust_kernel)
         case RangeRecord():
@@ -81,6 +86,20 @@ def _shared_drift(record: SharedDriftRecord) -> gtsam.NonlinearFactor:
         if jacobians is not None:
             jacobians[0], jacobians[1] = -_BIAS, _BIAS
         return np.asarray(values.atVector(keys[1])[2:] - values.atVector(keys[0])[2:])
+
+    return _custom(gtsam.noiseModel.Isotropic.Sigma(2, record.sigma_mps), keys, error)
+
+
+def _shared_walk(record: SharedWalkRecord) -> gtsam.NonlinearFactor:
+    keys = [*record.origins, *record.targets]
+    signs = (1.0, -1.0, -1.0, 1.0)
+
+    def error(_this: object, values: gtsam.Values, jacobians: _Jacobians) -> Array:
+        if jacobians is not None:
+            for k, sign in enumerate(signs):
+                jacobians[k] = sign * _BIAS
+        changes = [sign * values.atVector(k)[2:] for sign, k in zip(signs, keys, strict=True)]
+        return np.asarray(sum(changes))
 
     return _custom(gtsam.noiseModel.Isotropic.Sigma(2, record.sigma_mps), keys, error)
 

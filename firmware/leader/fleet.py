@@ -112,10 +112,10 @@ class Fleet:
         if buffer is None or not len(buffer):
             return
         track = buffer.track()
+        self._graph.extend(LEADER, self.own.track())
         if chain not in self._graph.vehicles():
             self._begin(chain, track)
         self._graph.extend(chain, track)
-        self._graph.extend(LEADER, self.own.track())
         self._graph.update()
 
     def use_ranges(self, chain: int) -> None:

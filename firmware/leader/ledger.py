@@ -56,6 +56,18 @@ class SharedDriftRecord:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SharedWalkRecord:
+    """Two vehicles in the same water: between two times their biases changed alike, to the sigma.
+
+    Keys are of nodes: origins of the two vehicles at the earlier time, targets at the later.
+    """
+
+    origins: tuple[int, int]
+    targets: tuple[int, int]
+    sigma_mps: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ClosureRecord:
     """A loop closure: position of target minus position of origin (2,), with its covariance."""
 
@@ -98,7 +110,13 @@ class AbsoluteRecord:
 
 
 Record = (
-    PriorRecord | OdometryRecord | SharedDriftRecord | ClosureRecord | RangeRecord | AbsoluteRecord
+    PriorRecord
+    | OdometryRecord
+    | SharedDriftRecord
+    | SharedWalkRecord
+    | ClosureRecord
+    | RangeRecord
+    | AbsoluteRecord
 )
 
 

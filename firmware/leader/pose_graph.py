@@ -9,7 +9,7 @@ The ISAM2 object is a cache of the ledger: poisoned as soon as it raises, and re
 """
 
 import itertools
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -17,6 +17,7 @@ from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 
 from firmware.geometry import Array
+from firmware.leader.chains import Chain, shared_walk
 from firmware.leader.factors import factor_of
 from firmware.leader.ledger import (
     AbsoluteRecord,
@@ -29,6 +30,7 @@ from firmware.leader.ledger import (
     Record,
     SharedDriftRecord,
 )
+from firmware.leader.solver import new_isam
 from firmware.leader.trajectory import Trajectory
 from firmware.submaps import Track
 from protocol.errors import EstimationError
@@ -59,6 +61,12 @@ class GraphSettings(Settings):
     bias_walk: float = setting(
         0.002, "m/s/sqrt(s)", "lets a current of 0.2 m/s turn within an hour", minimum=1e-7
     )
+    bias_walk_apart: float = setting(
+        0.0007, "m/s/sqrt(s)", "a current turns for all vehicles in it alike, nearly", minimum=1e-7
+    )
+    alike_interval_s: float = setting(
+        60.0, "s", "how often that is said: chains stay loosely coupled", minimum=10.0
+    )
     heading_bias_sigma_deg: float = setting(
         0.5, "degree", "mounting error of the attitude reference", minimum=1e-6
     )
@@ -74,29 +82,18 @@ class GraphSettings(Settings):
     )
 
 
-@dataclass(slots=True)
-class _Chain:
-    """The nodes of one vehicle, in time order, and the key of its parameters."""
-
-    number: int
-    parameters: int
-    times_s: list[float] = field(default_factory=list)
-    reckoned_m: list[Array] = field(default_factory=list)
-    keys: list[int] = field(default_factory=list)
-
-
 class PoseGraph:
     """Every vehicle's trajectory, and what ties them together."""
 
     def __init__(self, settings: GraphSettings) -> None:
         self._settings = settings
-        self._chains: dict[int, _Chain] = {}
+        self._chains: dict[int, Chain] = {}
         self._ledger: list[Entry] = []
         self._changed: set[int] = set()
         self._values = gtsam.Values()
         self._fresh = gtsam.Values()
         self._factorization = "CHOLESKY"  # until it calls a long chain indeterminate: then QR
-        self._isam = _new_isam(self._factorization)
+        self._isam = new_isam(self._factorization)
         self._factorised: tuple[SuperLU, dict[int, int]] | None = None
         self._trajectories: dict[int, Trajectory] = {}  # both until the next change
         self._newest_covariance: dict[int, Array] = {}
@@ -119,7 +116,7 @@ class PoseGraph:
         """
         s = self._settings
         number = len(self._chains)
-        chain = _Chain(number=number, parameters=gtsam.symbol("p", number))
+        chain = Chain(number=number, parameters=gtsam.symbol("p", number))
         self._chains[vehicle] = chain
         state = np.concatenate([start_m, np.zeros(2)])
         key = self._append(chain, time_s, reckoned_m, state)
@@ -151,14 +148,18 @@ class PoseGraph:
         Epochs in a gap of the track are passed over: positions are composed, so the next node
         ties to the last across the gap.
         """
-        chain, interval_s = self._chains[vehicle], self._settings.node_interval_s
-        first = int(np.floor(chain.times_s[-1] / interval_s + 1e-9)) + 1
-        last = int(np.floor(track.time_s[-1] / interval_s + 1e-9))
+        chain, s = self._chains[vehicle], self._settings
+        interval_s = s.node_interval_s
+        begin = int(np.floor(chain.times_s[-1] / interval_s + 1e-9)) + 1
+        end = int(np.floor(track.time_s[-1] / interval_s + 1e-9))
         added = 0
-        for epoch in range(first, last + 1):
+        for epoch in range(begin, end + 1):
             time_s = epoch * interval_s
             if np.min(np.abs(track.time_s - time_s)) <= interval_s / 2:
                 self._step(chain, time_s, track.position_at(time_s))
+                first = next(iter(self._chains.values()))
+                for tie in shared_walk(first, chain, s.alike_interval_s, s.bias_walk_apart):
+                    self._enter(tie)
                 added += 1
         return added
 
@@ -312,7 +313,7 @@ class PoseGraph:
             self._state(record.origin.key)[:2], self._state(record.target.key)[:2]
         )
 
-    def _append(self, chain: _Chain, time_s: float, reckoned_m: Array, state: Array) -> int:
+    def _append(self, chain: Chain, time_s: float, reckoned_m: Array, state: Array) -> int:
         key: int = gtsam.symbol("x", (chain.number << 24) | len(chain.keys))
         chain.times_s.append(time_s)
         chain.reckoned_m.append(np.asarray(reckoned_m, dtype=np.float64))
@@ -322,7 +323,7 @@ class PoseGraph:
         self._newest_covariance.clear()
         return key
 
-    def _step(self, chain: _Chain, time_s: float, reckoned_m: Array) -> None:
+    def _step(self, chain: Chain, time_s: float, reckoned_m: Array) -> None:
         s = self._settings
         before, interval_s = chain.keys[-1], time_s - chain.times_s[-1]
         moved_m = reckoned_m - chain.reckoned_m[-1]
@@ -363,7 +364,7 @@ class PoseGraph:
         for entry in self._ledger:
             entry.slot = None
         graph, entries = self._active_factors()
-        self._isam = _new_isam(self._factorization)
+        self._isam = new_isam(self._factorization)
         result = self._isam.update(graph, values)
         for entry, slot in zip(entries, result.getNewFactorsIndices(), strict=True):
             entry.slot = slot
@@ -397,12 +398,3 @@ class PoseGraph:
                 raise EstimationError("the information matrix is singular") from error
             self._factorised = solver, first
         return self._factorised
-
-
-def _new_isam(factorization: str) -> gtsam.ISAM2:
-    parameters = gtsam.ISAM2Params()
-    parameters.setFactorization(factorization)
-    parameters.setRelinearizeThreshold(0.02)
-    parameters.relinearizeSkip = 1
-    parameters.findUnusedFactorSlots = True  # memory stays with what is active
-    return gtsam.ISAM2(parameters)

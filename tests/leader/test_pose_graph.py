@@ -1,5 +1,7 @@
 """The incremental pose graph against a dense solution of the same records."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -141,3 +143,20 @@ def test_ledger_holds_every_record_that_the_graph_was_told() -> None:
     assert kinds.count(PriorRecord) == 4
     assert kinds.count(SharedDriftRecord) == 1
     assert kinds.count(OdometryRecord) == 10
+
+
+def test_current_that_turns_for_one_vehicle_turns_for_the_other() -> None:
+    """The first vehicle sees the turn by fixes; the other has none after the tenth minute."""
+    time_s = np.arange(0.0, 1801.0)
+    drift_m = np.cumsum(np.where(time_s < 900.0, 0.1, -0.1))
+    track = Track(time_s=time_s, north_m=drift_m, east_m=0 * time_s, yaw_rad=0 * time_s)
+    misses_m = []
+    for settings in (SETTINGS, dataclasses.replace(SETTINGS, bias_walk_apart=1.0)):
+        graph = started(track, 1, started(track, 0, PoseGraph(settings)))
+        for second in range(0, 1801, 60):
+            for vehicle in (0, 1) if second <= 600 else (0,):
+                anchor = graph.anchor(vehicle, float(second), track)
+                graph.add_absolute(anchor, np.zeros(2), np.eye(2))
+        graph.update()
+        misses_m.append(float(np.abs(graph.trajectory(1).position_m[-1, 0])))
+    assert misses_m[0] < 0.5 * misses_m[1]

@@ -1,0 +1,256 @@
+"""The follower's core: what it sends in which slots, and what the water may do to it."""
+
+import copy
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+
+from firmware.follower.core import FollowerCore
+from firmware.soundings import Odometry
+from protocol.codec import decode, encode
+from protocol.packets import (
+    Answer,
+    ExtendedAnswer,
+    Header,
+    Packet,
+    Profile,
+    SubmapFragment,
+    SubmapPacket,
+    TrajectoryPacket,
+)
+from protocol.schedule import Slots
+from tests.leader.vessels import follower_of, line, sail, slots_of
+
+PATH = line(0.0, 0.0)
+
+
+def sent(
+    core: FollowerCore, until_s: float, begin_s: float = 0.0, sonar_until_s: float = np.inf
+) -> list[Packet]:
+    """Sail on and return what was transmitted."""
+    packets = []
+    for quarter in range(round(4 * begin_s) + 1, round(4 * until_s) + 1):
+        now_s = quarter / 4.0
+        sail(core, PATH, now_s, sonar_on=now_s <= sonar_until_s)
+        core.tick(now_s)
+        frame = core.poll(now_s)
+        if frame is not None:
+            assert now_s == round(now_s)
+            packets.append(decode(frame))
+    return packets
+
+
+def answer_of(time_s: float, north_m: float, east_m: float, **changes: object) -> bytes:
+    header = Header(
+        profile=Profile.ANSWER,
+        vehicle=0,
+        boot_epoch=0,
+        submap=1,
+        fragment=1,
+        fragment_count=0,
+        tx_second=0,
+        time_quarters=round(4 * time_s) % (1 << 20),
+    )
+    header = dataclasses.replace(header, **changes)  # type: ignore[arg-type]
+    return encode(Answer(header=header, submap=0, north_m=north_m, east_m=east_m))
+
+
+def extended_of(answer: bytes, **changes: object) -> bytes:
+    plain = decode(answer)
+    assert isinstance(plain, Answer)
+    values: dict[str, object] = {
+        "header": dataclasses.replace(plain.header, profile=Profile.ANSWER_EXTENDED),
+        "submap": plain.submap,
+        "north_m": plain.north_m,
+        "east_m": plain.east_m,
+        "variance_m2": 4.0,
+        "leader_north_m": 150.0,
+        "leader_east_m": 600.0,
+        "leader_variance_m2": 1.0,
+        "repeat_submap": 0,
+        "missing_fragments": 0,
+    }
+    return encode(ExtendedAnswer(**{**values, **changes}))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("followers", "frames"), [(1, 10), (2, 5), (3, 3), (4, 2)], ids=str)
+def test_lattice_takes_as_many_frames_as_the_air_has(followers: int, frames: int) -> None:
+    core = follower_of(PATH, slots=slots_of(followers), profile="lattice")
+    fragments = [p for p in sent(core, 60.0) if isinstance(p, SubmapFragment)]
+    assert {p.header.fragment_count for p in fragments} == {frames}
+    assert not core.status().get("submaps_without_air")
+
+
+def test_number_of_frames_can_be_set() -> None:
+    core = follower_of(PATH, profile="lattice", frames_per_submap=4)
+    fragments = [p for p in sent(core, 60.0) if isinstance(p, SubmapFragment)]
+    assert {p.header.fragment_count for p in fragments} == {4}
+
+
+def test_paper_profile_in_shared_air_leaves_whole_submaps_out() -> None:
+    core = follower_of(PATH, slots=slots_of(2))
+    packets = [p for p in sent(core, 200.0) if isinstance(p, SubmapPacket)]
+    whole = {p.header.submap for p in packets}
+    assert core.status()["submaps_without_air"] >= 3
+    for submap in sorted(whole)[:-1]:
+        fragments = [p.header.fragment for p in packets if p.header.submap == submap]
+        assert fragments == list(range(10))
+
+
+def test_after_the_survey_the_trajectory_goes_out_alone() -> None:
+    packets = sent(follower_of(PATH), 150.0, sonar_until_s=40.0)
+    last = packets[-1]
+    assert isinstance(last, TrajectoryPacket)
+    assert np.isfinite(last.states).all()
+    assert last.header.time_quarters / 4.0 + 19.0 == pytest.approx(150.0, abs=2.1)
+
+
+def test_small_frames_have_small_trajectories() -> None:
+    core = follower_of(PATH, profile="lattice", **{"compression.small_frames": True})
+    packets = sent(core, 150.0, sonar_until_s=40.0)
+    assert {len(encode(p)) for p in packets} == {62}
+    assert isinstance(packets[-1], TrajectoryPacket)
+
+
+def test_repeats_take_only_slots_that_fresh_fragments_leave() -> None:
+    core = follower_of(PATH, profile="lattice", frames_per_submap=6)
+    first = sent(core, 40.0)
+    core.receive_frame(
+        extended_of(answer_of(20.0, 40.0, 0.0), missing_fragments=0b111111), None, 48.0
+    )
+    later = sent(core, 100.0, begin_s=40.0)
+    repeated = [p.header.fragment for p in later if p.header.submap == 0]
+    assert len(first) == 6 or len(repeated) >= 6
+    assert core.status()["fragments_repeated"] == 6
+    for submap in (1, 2, 3):
+        fresh = [p for p in later if p.header.submap == submap]
+        assert sorted(p.header.fragment for p in fresh) == list(range(6))
+
+
+def test_full_air_repeats_nothing() -> None:
+    core = follower_of(PATH, slots=Slots(slots_of().settings), profile="lattice")
+    sent(core, 50.0)
+    packets = []
+    for now_s in range(50, 130, 10):
+        core.receive_frame(
+            extended_of(answer_of(20.0, 40.0, 0.0), missing_fragments=0b11), None, float(now_s)
+        )
+        packets += sent(core, now_s + 10.0, begin_s=float(now_s))
+    for submap in (2, 3, 4):
+        assert sum(p.header.submap == submap for p in packets) == 10
+    assert not core.status().get("submaps_without_air")
+
+
+@functools.cache
+def survey() -> FollowerCore:
+    core = follower_of(PATH)
+    sent(core, 99.0)
+    return core
+
+
+def surveyed() -> FollowerCore:
+    """Return a follower that has surveyed for 99 s, alone with whoever asks."""
+    return copy.deepcopy(survey())
+
+
+def test_answer_corrects_the_belief() -> None:
+    core = surveyed()
+    for time_s in (60.0, 70.0, 80.0):
+        core.receive_frame(answer_of(time_s, 2 * time_s + 15.0, 0.0), None, 100.0)
+    assert core.belief().position_m[0] == pytest.approx(198.0 + 17.0, abs=8.0)
+    assert core.reckoned.north_m == pytest.approx(198.0)
+
+
+def test_told_variance_is_used() -> None:
+    spreads_m2 = []
+    for variance_m2 in (1.0, 100.0):
+        core = surveyed()
+        frame = extended_of(answer_of(90.0, 185.0, 3.0), variance_m2=variance_m2)
+        core.receive_frame(frame, None, 100.0)
+        spreads_m2.append(core.belief().covariance_m2[0, 0])
+    assert spreads_m2[0] < spreads_m2[1]
+
+
+def test_extended_answer_to_another_follower_ranges_too() -> None:
+    core = surveyed()
+    frame = extended_of(answer_of(90.0, 0.0, 0.0, fragment=2, tx_second=99 % 16))
+    travel_s = float(np.hypot(600.0, 150.0 - 198.0)) / 1500.0
+    core.receive_frame(frame, 99.0 + travel_s, 100.0)
+    assert core.status()["ranges_used"] == 1
+    assert core.status()["answers_to_others"] == 1
+    assert core.status()["answers_used"] == 0
+
+
+@pytest.mark.parametrize("toa_s", [99.0, 99.0 + 100_000.0 / 1500.0, -50.0, 1e9])
+def test_absurd_range_is_a_counted_drop(toa_s: float) -> None:
+    core = surveyed()
+    before_m = core.belief().position_m
+    frame = extended_of(answer_of(90.0, 0.0, 0.0, fragment=2, tx_second=99 % 16))
+    core.receive_frame(frame, toa_s, 100.0)
+    status = core.status()
+    assert status["ranges_gated"] + status.get("ranges_unplaceable", 0) == 1
+    assert core.belief().position_m == pytest.approx(before_m)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_answer_that_is_no_position_or_variance_is_dropped(bad: float) -> None:
+    core = surveyed()
+    core.receive_frame(answer_of(90.0, bad, 0.0), None, 100.0)
+    core.receive_frame(extended_of(answer_of(90.0, 180.0, 0.0), variance_m2=bad), 99.5, 100.0)
+    core.receive_frame(extended_of(answer_of(90.0, 180.0, 0.0), variance_m2=-1.0), None, 100.0)
+    core.receive_frame(extended_of(answer_of(90.0, 180.0, 0.0), leader_north_m=bad), 99.5, 100.0)
+    assert np.isfinite(core.belief().position_m).all()
+    status = core.status()
+    dropped = status.get("frames_rejected", 0) + status["answers_gated"]
+    assert dropped >= 3
+    assert status["answers_used"] <= 1
+
+
+@pytest.mark.parametrize("time_s", [200.0, 5000.0, -400.0])
+def test_answer_about_the_future_or_long_ago_is_counted(time_s: float) -> None:
+    core = surveyed()
+    core.receive_frame(answer_of(time_s, 0.0, 0.0), None, 100.0)
+    assert core.status()["answers_unplaceable"] == 1
+
+
+def test_answer_to_an_earlier_boot_teaches_nothing() -> None:
+    core = follower_of(PATH, boot_epoch=1)
+    sent(core, 40.0)
+    core.receive_frame(answer_of(20.0, 500.0, 500.0), None, 40.0)
+    assert core.status()["answers_to_others"] == 1
+    assert core.status()["answers_used"] == 0
+
+
+def test_reflected_and_damaged_frames_are_counted() -> None:
+    core = follower_of(PATH)
+    own = [encode(p) for p in sent(core, 60.0)]
+    core.receive_frame(own[0], None, 60.0)
+    core.receive_frame(answer_of(20.0, 0.0, 0.0, vehicle=3), None, 60.0)
+    core.receive_frame(own[0][:-1] + b"\0", None, 60.0)
+    assert core.status()["frames_not_for_us"] == 2
+    assert core.status()["frames_rejected"] == 1
+
+
+def test_clock_that_is_set_back_does_not_silence_the_follower() -> None:
+    core = surveyed()
+    core.poll(5000.0)
+    assert sent(core, 130.0, begin_s=99.0)
+
+
+def test_navigation_that_fails_for_a_while_is_counted_and_goes_on() -> None:
+    core = surveyed()
+    core.receive_odometry(
+        Odometry(
+            time_s=99.25,
+            velocity_north_mps=np.nan,
+            velocity_east_mps=np.inf,
+            yaw_rad=np.nan,
+            depth_m=np.nan,
+        )
+    )
+    packets = sent(core, 130.0, begin_s=99.25)
+    assert core.status()["bad_odometry"] == 1
+    assert packets
+    assert np.isfinite(core.belief().position_m).all()

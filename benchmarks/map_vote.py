@@ -51,6 +51,7 @@ def windows(
                     query=query,
                     shift_m=shift + walk,
                     covariance_m2=covariance,
+                    matching=settings,
                 )
             )
     return made
@@ -90,7 +91,7 @@ def main() -> None:
             ):
                 made = windows(first, second, shift, rng, matching)
                 started = time.perf_counter()
-                votes.append(vote(made, matching, settings, misfit).log_ratio)
+                votes.append(vote(made, settings, misfit).log_ratio)
                 took_s.append(time.perf_counter() - started)
         right = np.quantile(valid, [0.05, 0.5, 0.95])
         wrong = np.quantile(invalid, [0.05, 0.5, 0.95])

@@ -11,6 +11,7 @@ from firmware.geometry import Array
 from firmware.leader.atlas import Atlas, Sheet, SheetId, overlap_m2
 from firmware.leader.ledger import Anchor
 from firmware.leader.matching import MatchingSettings, MatchOutcome, match
+from firmware.leader.pairing import Calibrations, side_of
 from firmware.leader.pose_graph import PoseGraph
 from firmware.submaps import GriddedSubmap
 from protocol.settings import Settings, setting
@@ -100,27 +101,36 @@ def jobs_for(
     graph: PoseGraph,
     settings: ClosureSettings,
     matching: MatchingSettings,
+    calibrations: Calibrations | None = None,
 ) -> list[MatchJob]:
-    """Return the matches worth trying for a new sheet, most overlap first, bounded in number."""
-    ranked = _ranked(sheet, atlas, graph, settings)
-    grid, drift_mps = sheet.without_drift(graph.trajectory(sheet.id.chain))
-    jobs = []
-    for other, covariance_m2 in ranked[: settings.pairs_per_submap]:
-        other_grid, other_drift_mps = other.without_drift(graph.trajectory(other.id.chain))
-        jobs.append(
-            MatchJob(
-                origin=other,
-                target=sheet,
-                origin_grid=other_grid,
-                target_grid=grid,
-                origin_drift_mps=other_drift_mps,
-                target_drift_mps=drift_mps,
-                prior_shift_m=_correction(sheet, graph) - _correction(other, graph),
-                prior_covariance_m2=covariance_m2,
-                settings=matching,
-            )
+    """Return the matches worth trying for a new sheet, most overlap first, bounded in number.
+
+    Pairs that the graph knows well teach the calibrations first (new ones, if none are given);
+    then what the sonars do wrong is taken out of all.
+    """
+    calibrations = calibrations or Calibrations(matching)
+    target = side_of(sheet, graph.trajectory(sheet.id.chain))
+    pairs = []
+    for other, covariance_m2 in _ranked(sheet, atlas, graph, settings)[: settings.pairs_per_submap]:
+        origin = side_of(other, graph.trajectory(other.id.chain))
+        shift_m = _correction(sheet, graph) - _correction(other, graph)
+        calibrations.learn(origin, target, shift_m, covariance_m2)
+        pairs.append((origin, shift_m, covariance_m2))
+    grid = calibrations.level(target)
+    return [
+        MatchJob(
+            origin=origin.sheet,
+            target=sheet,
+            origin_grid=calibrations.level(origin),
+            target_grid=grid,
+            origin_drift_mps=origin.drift_mps,
+            target_drift_mps=target.drift_mps,
+            prior_shift_m=shift_m,
+            prior_covariance_m2=covariance_m2,
+            settings=calibrations.matching_of(origin, target, shift_m),
         )
-    return jobs
+        for origin, shift_m, covariance_m2 in pairs
+    ]
 
 
 def closure_of(

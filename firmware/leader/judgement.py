@@ -24,6 +24,7 @@ from firmware.leader.consistency import (
 )
 from firmware.leader.map_vote import VoteSettings, VoteWindow, carried, vote
 from firmware.leader.matching import MatchingSettings
+from firmware.leader.pairing import Calibrations, side_of
 from firmware.leader.pose_graph import PoseGraph
 from protocol.settings import Settings, setting
 
@@ -61,9 +62,15 @@ class JudgementSettings(Settings):
 class Judgement:
     """Decides on gated closures; keeps those that wait, bounded."""
 
-    def __init__(self, settings: JudgementSettings, matching: MatchingSettings) -> None:
+    def __init__(
+        self,
+        settings: JudgementSettings,
+        matching: MatchingSettings,
+        calibrations: Calibrations | None = None,
+    ) -> None:
         self.counters: Counter[str] = Counter()
-        self._settings, self._matching = settings, matching
+        self._settings = settings
+        self._calibrations = calibrations or Calibrations(matching)
         self._waiting: deque[Closure] = deque(maxlen=settings.waiting)
 
     def consider(self, gated: list[Closure], atlas: Atlas, graph: PoseGraph) -> None:
@@ -122,7 +129,7 @@ class Judgement:
         ]
         if not windows:
             return False
-        outcome = vote(windows, self._matching, self._settings.vote, closure.misfit)
+        outcome = vote(windows, self._settings.vote, closure.misfit)
         return outcome.informed > 0 and outcome.log_ratio > self._settings.vote_ratio
 
     def _window(
@@ -134,20 +141,26 @@ class Judgement:
     ) -> VoteWindow:
         shift_m = closure.offset_m - (closure.target_reckoned_m - closure.origin_reckoned_m)
         trajectories = [graph.trajectory(sheet.id.chain) for sheet in matched]
-        (reference, reference_drift), (query, query_drift) = (
-            sheet.without_drift(trajectory)
+        reference, query = (
+            side_of(sheet, trajectory)
             for sheet, trajectory in zip(neighbours, trajectories, strict=True)
         )
+        matching = self._calibrations.matching_of(reference, query, shift_m)
         ages_s = (
             neighbours[0].time_s - closure.origin_anchor.time_s,
             neighbours[1].time_s - closure.target_anchor.time_s,
         )
         shift_m, covariance_m2 = carried(
-            shift_m, closure.covariance_m2, ages_s, (reference_drift, query_drift), self._matching
+            shift_m,
+            closure.covariance_m2,
+            ages_s,
+            (reference.drift_mps, query.drift_mps),
+            matching,
         )
         return VoteWindow(
-            reference=reference,
-            query=query,
+            reference=self._calibrations.level(reference),
+            query=self._calibrations.level(query),
+            matching=matching,
             shift_m=shift_m,
             covariance_m2=covariance_m2,
             reference_reconstructed=neighbours[0].reconstructed,

@@ -48,13 +48,15 @@ class VoteWindow:
     """Two neighbours of a closure's sub-maps, drift removed, each in its raw dead reckoning.
 
     shift_m (2,) is what the closure says is to be added to the query's coordinates so that it lies
-    on the reference, covariance_m2 (2, 2) of it with the dead reckoning since (`carried`).
+    on the reference, covariance_m2 (2, 2) of it with the dead reckoning since (`carried`);
+    matching holds the sigmas of what spoils this pair.
     """
 
     reference: GriddedSubmap
     query: GriddedSubmap
     shift_m: Array
     covariance_m2: Array
+    matching: MatchingSettings
     reference_reconstructed: bool = False
     query_reconstructed: bool = False
 
@@ -74,7 +76,6 @@ class Vote:
 
 def vote(
     windows: Iterable[VoteWindow],
-    matching: MatchingSettings,
     settings: VoteSettings,
     matched_misfit: float = 1.0,
 ) -> Vote:
@@ -84,7 +85,7 @@ def vote(
     (`Match.residual / Match.variance_m2`): its neighbours should fit about as well.
     """
     tolerated = settings.tolerance * float(np.clip(matched_misfit, *_MISFIT_RANGE))
-    ratios = tuple(_ratio(window, matching, settings, tolerated) for window in windows)
+    ratios = tuple(_ratio(window, settings, tolerated) for window in windows)
     return Vote(
         log_ratio=float(sum(ratios)),
         informed=sum(ratio != 0.0 for ratio in ratios),
@@ -113,13 +114,11 @@ def carried(
     return shift, covariance_m2 + walk_m2 * np.eye(2)
 
 
-def _ratio(
-    window: VoteWindow, matching: MatchingSettings, settings: VoteSettings, tolerated: float
-) -> float:
+def _ratio(window: VoteWindow, settings: VoteSettings, tolerated: float) -> float:
     problem = pair_problem(
         window.reference,
         window.query,
-        matching,
+        window.matching,
         reference_reconstructed=window.reference_reconstructed,
         query_reconstructed=window.query_reconstructed,
     )

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from firmware.geometry import Array
+from firmware.leader.calibration import CalibrationSettings
 from protocol.settings import Settings, setting
 
 
@@ -40,6 +41,9 @@ class MatchingSettings(Settings):
     )
     bend_sigma_per_m: float = setting(
         4e-5, "1/m", "a smile of 0.15 m at the edge of a 60 m swath", minimum=0.0
+    )
+    calibration: CalibrationSettings = setting(
+        CalibrationSettings, "", "swath errors learned from overlaps"
     )
     drift_sigma_mps: float = setting(
         0.03, "m/s", "drift within a sub-map that is left after its removal", minimum=0.0

@@ -110,7 +110,7 @@ def pair_problem(
         reference=layers[0],
         query=layers[1],
         settings=settings,
-        noise=_noise_model(settings, shared_m2 / noise_m2),
+        noise=noise_model(settings, shared_m2 / noise_m2),
         minimum_cells=settings.minimum_overlap_m2 / query.cell_m**2,
         ridge_cells=noise_m2 / offset_m2 if offset_m2 > 0.0 else np.inf,
         spectra=spectra,
@@ -135,7 +135,8 @@ def _per_cell(values: Array, layer: Layer) -> float:
     return float(values.sum() / layer.known.sum())
 
 
-def _noise_model(settings: MatchingSettings, correlated_share: float) -> NoiseModel:
+def noise_model(settings: MatchingSettings, correlated_share: float) -> NoiseModel:
+    """Return the standard deviations that a fit assumes."""
     return NoiseModel(
         cell_sigma_m=settings.cell_sigma_m,
         position_sigma_m=settings.position_sigma_m,

@@ -19,15 +19,16 @@ def window(
         query=scene.submap(180, 230, (70, 41), shift_m=shift_m),
         shift_m=np.array(believed_m),
         covariance_m2=np.eye(2) * 2.0,
+        matching=MATCHING,
     )
 
 
 def test_windows_speak_for_a_true_closure_and_against_a_false_one(scene: Scene) -> None:
     windows = [window(scene, (6.0, -8.0), (5.0, -7.0)) for _ in range(3)]
-    true = vote(windows, MATCHING, SETTINGS)
+    true = vote(windows, SETTINGS)
     assert true.informed == 3
     assert true.log_ratio > 10.0
-    false = vote([window(scene, (6.0, -8.0), (-24.0, 20.0))], MATCHING, SETTINGS)
+    false = vote([window(scene, (6.0, -8.0), (-24.0, 20.0))], SETTINGS)
     assert false.log_ratio < -3.0
 
 
@@ -40,16 +41,17 @@ def test_flat_seabed_and_far_windows_abstain(scene: Scene) -> None:
         query=scene.submap(200, 210, (41, 70), relief=level),
         shift_m=np.zeros(2),
         covariance_m2=np.eye(2),
+        matching=MATCHING,
     )
     far = dataclasses.replace(flat, shift_m=np.array([5000.0, 0.0]))
-    result = vote([flat, far], MATCHING, SETTINGS)
+    result = vote([flat, far], SETTINGS)
     assert result.ratios == (0.0, 0.0)
     assert result.informed == 0
-    assert vote([], MATCHING, SETTINGS).log_ratio == 0.0
+    assert vote([], SETTINGS).log_ratio == 0.0
 
 
 def test_one_window_cannot_carry_the_vote(scene: Scene) -> None:
-    result = vote([window(scene, (0.0, 0.0), (0.0, 0.0))], MATCHING, SETTINGS)
+    result = vote([window(scene, (0.0, 0.0), (0.0, 0.0))], SETTINGS)
     assert result.log_ratio == SETTINGS.window_limit
 
 

@@ -1,0 +1,185 @@
+"""Each vehicle's roll bias, refraction smile and depth wander, learned from its own overlaps.
+
+A patch test without end: where a vehicle crosses or neighbours its own soundings and dead
+reckoning still knows the way between them, the two passes differ by what the sonar does wrong. A
+fit of offset, shift (with the graph's prior) and swath errors leaves information on roll and smile,
+summed recursively and slowly forgotten, for water changes.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from firmware.geometry import Array
+from firmware.leader.alignment import NoiseModel, align, fields_of
+from firmware.leader.screening import land, prepare, sample
+from firmware.leader.swath import Swath
+from firmware.submaps import GriddedSubmap
+from protocol.settings import Settings, setting
+
+_ITERATIONS = 4  # the shift's prior keeps the fit near its start
+_LONGEST_STEP_M = 3.0  # gradients are not believed farther than their smoothing
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrationSettings(Settings):
+    """What swath errors are expected and how fast evidence on them grows."""
+
+    roll_sigma: float = setting(0.005, "rad", "mounting of a sonar head: 0.3 degree", minimum=1e-6)
+    smile_sigma: float = setting(
+        0.004, "1", "sound speed wrong by 3 m/s, seen at 60 degrees", minimum=1e-6
+    )
+    wander_m: float = setting(
+        0.3, "m", "tide and depth sensor between two distant passes", minimum=0.001
+    )
+    wander_time_s: float = setting(
+        600.0, "s", "tide and depth sensor stay alike for ten minutes", minimum=1.0
+    )
+    memory_s: float = setting(
+        7200.0, "s", "the water's sound speed changes within hours", minimum=60.0
+    )
+    reach_m: float = setting(
+        12.0, "m", "sigma of a shift up to which seabed slopes still speak", minimum=0.1
+    )
+    redundancy: float = setting(
+        30.0, "cells", "that err together: neighbours, and sheets that share soundings", minimum=1.0
+    )
+    misfit_limit: float = setting(
+        3.0, "", "mean square residual over noise of an overlap that can be trusted", minimum=0.1
+    )
+    minimum_cells: int = setting(80, "cells", "fewer are a corner of the swath", minimum=20)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Overlap:
+    """Two passes over the same ground; the shift's prior is the graph's.
+
+    Sides of another vehicle than the one to be calibrated come levelled and without a swath.
+    """
+
+    reference: GriddedSubmap
+    query: GriddedSubmap
+    reference_swath: Swath | None
+    query_swath: Swath | None
+    shift_m: Array
+    covariance_m2: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Evidence:
+    """Information (2, 2) on roll and smile, and its vector (2,)."""
+
+    information: Array
+    vector: Array
+
+
+class Calibration:
+    """What is known of one vehicle's swath errors."""
+
+    def __init__(self, settings: CalibrationSettings) -> None:
+        self._settings = settings
+        self._prior = np.diag([settings.roll_sigma**-2, settings.smile_sigma**-2])
+        self._information = np.zeros((2, 2))
+        self._vector = np.zeros(2)
+        self._time_s: float | None = None
+        self.overlaps_used = 0
+
+    @property
+    def errors(self) -> Array:
+        """Expected roll bias in rad and smile, (2,)."""
+        return np.asarray(np.linalg.solve(self._information + self._prior, self._vector))
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance (2, 2) of the errors."""
+        return np.asarray(np.linalg.inv(self._information + self._prior))
+
+    def learn(self, overlap: Overlap, noise: NoiseModel, now_s: float) -> bool:
+        """Use an overlap if it can be trusted; say whether."""
+        if np.linalg.eigvalsh(overlap.covariance_m2)[-1] > self._settings.reach_m**2:
+            return False
+        found = _evidence_of(overlap, noise, self._settings, self._information + self._prior)
+        if found is None:
+            return False
+        if self._time_s is not None:
+            kept = float(np.exp(-max(now_s - self._time_s, 0.0) / self._settings.memory_s))
+            self._information, self._vector = self._information * kept, self._vector * kept
+        self._time_s = now_s
+        self._information = self._information + found.information
+        self._vector = self._vector + found.vector
+        self.overlaps_used += 1
+        return True
+
+
+def _evidence_of(
+    overlap: Overlap, noise: NoiseModel, settings: CalibrationSettings, known: Array
+) -> _Evidence | None:
+    """Return the information that an overlap adds once shift and offset are marginalised."""
+    layers = [
+        prepare(_pure(overlap.reference, overlap.reference_swath), reconstructed=False),
+        prepare(_pure(overlap.query, overlap.query_swath), reconstructed=False),
+    ]
+    if layers[0] is None or layers[1] is None:
+        return None
+    reference, query = layers[0], layers[1]
+    fields = fields_of(reference, 0.5), fields_of(query, 0.5)
+    tracks = (
+        _basis(overlap.reference_swath, overlap.reference, reference.grid),
+        _basis(overlap.query_swath, overlap.query, query.grid),
+    )
+    inverse = np.linalg.inv(overlap.covariance_m2)
+    shift = np.array(overlap.shift_m, dtype=np.float64)
+    prior = np.zeros((5, 5))
+    prior[:2, :2], prior[2, 2] = inverse, noise.offset_sigma_m**-2
+    for _ in range(_ITERATIONS):
+        field = align(reference, query, fields, shift, (None, None), noise)
+        at = land(reference.grid, query.grid, shift)
+        if field is None or at is None or field.both.sum() < settings.minimum_cells:
+            return None
+        slope = 0.5 * (field.slope_r + field.slope_q)
+        swath = (sample(tracks[0], at) - tracks[1][:, *at.query]) * field.both
+        design = np.concatenate([slope, field.both[None], swath]).reshape(5, -1)
+        weight = field.weight.ravel() / settings.redundancy
+        away = np.zeros(5)
+        away[:2] = inverse @ (shift - overlap.shift_m)
+        normal = (design * weight) @ design.T + prior
+        right = (design * weight) @ field.difference_m.ravel() + away
+        damped = normal.copy()
+        damped[3:, 3:] += known
+        unknowns = np.linalg.solve(damped, right)
+        length = float(np.hypot(*unknowns[:2]))
+        shift = shift - unknowns[:2] * min(1.0, _LONGEST_STEP_M / max(length, 1e-9))
+    residual = field.difference_m.ravel() - unknowns @ design
+    misfit = float(np.sum(field.weight.ravel() * residual**2) / field.both.sum())
+    if not np.isfinite(misfit) or misfit > settings.misfit_limit:
+        return None
+    gain = np.linalg.solve(normal[:3, :3], normal[:3, 3:])
+    scale = 1.0 / max(misfit, 1.0)
+    return _Evidence(
+        information=scale * (normal[3:, 3:] - normal[3:, :3] @ gain),
+        vector=scale * (right[3:] - gain.T @ right[:3]),
+    )
+
+
+def _pure(grid: GriddedSubmap, swath: Swath | None) -> GriddedSubmap:
+    """Return the grid where its across-track distance is meant."""
+    if swath is None:
+        return grid
+    return GriddedSubmap(
+        north0_m=grid.north0_m,
+        east0_m=grid.east0_m,
+        cell_m=grid.cell_m,
+        depth_m=np.where(swath.pure, grid.depth_m, np.nan),
+        variance_m2=grid.variance_m2,
+        time_s=grid.time_s,
+    )
+
+
+def _basis(swath: Swath | None, grid: GriddedSubmap, cropped: GriddedSubmap) -> Array:
+    """Return the part of a grid's basis that a crop of it covers; zero without a swath."""
+    rows, columns = cropped.depth_m.shape
+    if swath is None:
+        return np.zeros((2, rows, columns))
+    row = round((cropped.north0_m - grid.north0_m) / grid.cell_m)
+    column = round((cropped.east0_m - grid.east0_m) / grid.cell_m)
+    return swath.basis[:, row : row + rows, column : column + columns]

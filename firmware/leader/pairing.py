@@ -1,0 +1,135 @@
+"""A pair of sub-maps made ready for its match: drift, roll bias and smile taken out of both.
+
+What calibration does not know yet of the pair's swath errors, and how far tide and depth sensor
+may have wandered between the passes, goes into the match as prior sigmas.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from firmware.geometry import Array
+from firmware.leader.alignment import NoiseModel
+from firmware.leader.atlas import Sheet
+from firmware.leader.calibration import Calibration, Overlap
+from firmware.leader.matches import MatchingSettings
+from firmware.leader.pair_problem import noise_model
+from firmware.leader.swath import Swath, levelled, swath_of
+from firmware.leader.trajectory import Trajectory
+from firmware.submaps import GriddedSubmap
+
+_TILT_FLOOR = 5e-4  # attitude drifts by 0.03 degree
+_BEND_FLOOR_PER_M = 3e-6  # sound speed differs by 0.2 m/s across a survey
+_OFFSET_FLOOR_M = 0.02  # heave and squat that do not average out
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Side:
+    """One sub-map without its drift, and where in the swath its cells lie."""
+
+    sheet: Sheet
+    grid: GriddedSubmap
+    drift_mps: Array
+    swath: Swath
+    starboard: Array  # (2,) unit vector, north and east
+    track_m: Array  # (2,) middle of the track, raw dead reckoning
+
+
+def side_of(sheet: Sheet, trajectory: Trajectory) -> Side:
+    """Return a sheet as a side of a pair."""
+    grid, drift_mps = sheet.without_drift(trajectory)
+    yaw_rad = float(np.interp(sheet.time_s, sheet.track.time_s, np.unwrap(sheet.track.yaw_rad)))
+    return Side(
+        sheet=sheet,
+        grid=grid,
+        drift_mps=drift_mps,
+        swath=swath_of(grid, sheet.track, drift_mps, sheet.time_s),
+        starboard=np.array([-np.sin(yaw_rad), np.cos(yaw_rad)]),
+        track_m=sheet.reckoned_at(sheet.time_s),
+    )
+
+
+class Calibrations:
+    """The calibration of every vehicle, and what it makes of pairs."""
+
+    def __init__(self, matching: MatchingSettings) -> None:
+        self._settings, self._matching = matching.calibration, matching
+        self._noise: NoiseModel = noise_model(matching, 0.0)
+        self._vehicles: dict[int, Calibration] = {}
+
+    def of(self, vehicle: int) -> Calibration:
+        """Return the calibration of a vehicle."""
+        return self._vehicles.setdefault(vehicle, Calibration(self._settings))
+
+    def learn(self, origin: Side, target: Side, shift_m: Array, covariance_m2: Array) -> None:
+        """Learn from a pair whose shift the graph knows well: own overlaps, or a known partner."""
+        sides = (origin, target)
+        now_s = max(side.sheet.time_s for side in sides)
+        vehicles = [side.sheet.id.vehicle for side in sides]
+        for vehicle in dict.fromkeys(vehicles):
+            mine = [side.sheet.id.vehicle == vehicle for side in sides]
+            if not all(mine) and not self._known(vehicles[mine.index(False)]):
+                continue
+            grids = [
+                side.grid if own else self.level(side)
+                for side, own in zip(sides, mine, strict=True)
+            ]
+            overlap = Overlap(
+                reference=grids[0],
+                query=grids[1],
+                reference_swath=origin.swath if mine[0] else None,
+                query_swath=target.swath if mine[1] else None,
+                shift_m=shift_m,
+                covariance_m2=covariance_m2,
+            )
+            self.of(vehicle).learn(overlap, self._noise, now_s)
+
+    def level(self, side: Side) -> GriddedSubmap:
+        """Return the grid of a side without the errors that its vehicle is known to make."""
+        return levelled(side.grid, side.swath, self.of(side.sheet.id.vehicle).errors)
+
+    def matching_of(self, origin: Side, target: Side, shift_m: Array) -> MatchingSettings:
+        """Return the settings of a match with the sigmas that remain for this pair."""
+        tilt, bend = self._remaining(origin, target, shift_m)
+        return dataclasses.replace(
+            self._matching,
+            depth_offset_sigma_m=self._wander_m(origin, target),
+            tilt_sigma=tilt,
+            bend_sigma_per_m=bend,
+        )
+
+    def _known(self, vehicle: int) -> bool:
+        calibration, s = self.of(vehicle), self._settings
+        sigmas = np.sqrt(np.diag(calibration.covariance))
+        return bool(sigmas[0] < 0.3 * s.roll_sigma and sigmas[1] < 0.3 * s.smile_sigma)
+
+    def _wander_m(self, origin: Side, target: Side) -> float:
+        s = self._settings
+        if self._matching.depth_offset_sigma_m == 0.0:
+            return 0.0
+        share = 1.0
+        if origin.sheet.id.vehicle == target.sheet.id.vehicle:
+            apart_s = abs(target.sheet.time_s - origin.sheet.time_s)
+            share = 1.0 - float(np.exp(-0.5 * (apart_s / s.wander_time_s) ** 2))
+        return float(np.hypot(s.wander_m * np.sqrt(share), _OFFSET_FLOOR_M))
+
+    def _remaining(self, origin: Side, target: Side, shift_m: Array) -> tuple[float, float]:
+        """Return sigmas of tilt and bend of the pair's difference half way between the tracks."""
+        half_m = 0.5 * (target.track_m + shift_m - origin.track_m)
+        slopes = []
+        for side, sign in ((origin, 1.0), (target, -1.0)):
+            across_m = float(side.starboard @ half_m) * sign
+            bend = 2.0 * np.clip(across_m / side.swath.half_width_m, -1.0, 1.0)
+            slopes.append(sign * np.outer(side.starboard, [1.0, bend]))
+        covariances = [self.of(side.sheet.id.vehicle).covariance for side in (origin, target)]
+        if origin.sheet.id.vehicle == target.sheet.id.vehicle:
+            slopes, covariances = [slopes[0] + slopes[1]], covariances[:1]
+        tilt = sum(g @ p @ g.T for g, p in zip(slopes, covariances, strict=True))
+        crossing = 1.0 - float(origin.starboard @ target.starboard) ** 2
+        width_m = min(origin.swath.half_width_m, target.swath.half_width_m)
+        bend_m2 = crossing * max(p[1, 1] for p in covariances) / width_m**2
+        return (
+            float(np.sqrt(np.linalg.eigvalsh(tilt)[-1] + _TILT_FLOOR**2)),
+            float(np.sqrt(bend_m2 + _BEND_FLOOR_PER_M**2)),
+        )

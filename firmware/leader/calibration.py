@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware.geometry import Array
-from firmware.leader.alignment import NoiseModel, align, fields_of
+from firmware.leader.alignment import Aligned, NoiseModel, align, fields_of
 from firmware.leader.screening import land, prepare, sample
 from firmware.leader.swath import Swath
 from firmware.submaps import GriddedSubmap
@@ -129,35 +129,70 @@ def _evidence_of(
     )
     inverse = np.linalg.inv(overlap.covariance_m2)
     shift = np.array(overlap.shift_m, dtype=np.float64)
-    prior = np.zeros((5, 5))
-    prior[:2, :2], prior[2, 2] = inverse, noise.offset_sigma_m**-2
+    system = None
     for _ in range(_ITERATIONS):
         field = align(reference, query, fields, shift, (None, None), noise)
         at = land(reference.grid, query.grid, shift)
         if field is None or at is None or field.both.sum() < settings.minimum_cells:
             return None
-        slope = 0.5 * (field.slope_r + field.slope_q)
         swath = (sample(tracks[0], at) - tracks[1][:, *at.query]) * field.both
-        design = np.concatenate([slope, field.both[None], swath]).reshape(5, -1)
-        weight = field.weight.ravel() / settings.redundancy
-        away = np.zeros(5)
-        away[:2] = inverse @ (shift - overlap.shift_m)
-        normal = (design * weight) @ design.T + prior
-        right = (design * weight) @ field.difference_m.ravel() + away
-        damped = normal.copy()
-        damped[3:, 3:] += known
-        unknowns = np.linalg.solve(damped, right)
+        system = _system(field, swath, settings)
+        system.normal[:2, :2] += inverse
+        system.right[:2] += inverse @ (shift - overlap.shift_m)
+        unknowns = system.solved(known)
         length = float(np.hypot(*unknowns[:2]))
         shift = shift - unknowns[:2] * min(1.0, _LONGEST_STEP_M / max(length, 1e-9))
-    residual = field.difference_m.ravel() - unknowns @ design
-    misfit = float(np.sum(field.weight.ravel() * residual**2) / field.both.sum())
-    if not np.isfinite(misfit) or misfit > settings.misfit_limit:
+    if system is None or not system.misfit(system.solved(known)) <= settings.misfit_limit:
         return None
-    gain = np.linalg.solve(normal[:3, :3], normal[:3, 3:])
-    scale = 1.0 / max(misfit, 1.0)
-    return _Evidence(
-        information=scale * (normal[3:, 3:] - normal[3:, :3] @ gain),
-        vector=scale * (right[3:] - gain.T @ right[:3]),
+    return system.evidence(max(system.misfit(system.solved(known)), 1.0))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _System:
+    """Normal equations of shift, offset, roll and smile (5), and what they were made from."""
+
+    design: Array  # (5, N)
+    weight: Array  # (N,)
+    difference_m: Array  # (N,)
+    normal: Array
+    right: Array
+    redundancy: float
+
+    def solved(self, known: Array) -> Array:
+        """Return the unknowns, with what is already known of roll and smile (2, 2)."""
+        damped = self.normal.copy()
+        damped[3:, 3:] += known
+        return np.asarray(np.linalg.solve(damped, self.right))
+
+    def misfit(self, unknowns: Array) -> float:
+        """Return the mean of squared normalised residuals."""
+        residual = self.difference_m - unknowns @ self.design
+        cells = np.count_nonzero(self.weight)
+        return float(self.redundancy * np.sum(self.weight * residual**2) / cells)
+
+    def evidence(self, misfit: float) -> _Evidence:
+        """Return what is left for roll and smile when shift and offset are marginalised."""
+        gain = np.linalg.solve(self.normal[:3, :3], self.normal[:3, 3:])
+        return _Evidence(
+            information=(self.normal[3:, 3:] - self.normal[3:, :3] @ gain) / misfit,
+            vector=(self.right[3:] - gain.T @ self.right[:3]) / misfit,
+        )
+
+
+def _system(field: Aligned, swath: Array, settings: CalibrationSettings) -> _System:
+    slope = 0.5 * (field.slope_r + field.slope_q)
+    design = np.concatenate([slope, field.both[None], swath]).reshape(5, -1)
+    weight = field.weight.ravel() / settings.redundancy
+    difference_m = field.difference_m.ravel()
+    normal = (design * weight) @ design.T
+    normal[2, 2] += settings.wander_m**-2
+    return _System(
+        design=design,
+        weight=weight,
+        difference_m=difference_m,
+        normal=normal,
+        right=(design * weight) @ difference_m,
+        redundancy=settings.redundancy,
     )
 
 

@@ -36,7 +36,7 @@ class CorrectionSettings(DriftSettings):
         600.0, "s", "until then a leader may know no more than dead reckoning", minimum=1.0
     )
     echo_share: float = setting(
-        0.3, "1", "of what dead reckoning may have run away: what ranges alone tell", minimum=0.01,
+        0.5, "1", "of what dead reckoning may run away: what ranges alone tell", minimum=0.01,
         maximum=1.0,
     )  # fmt: skip
     sound_speed_mps: float = setting(

@@ -29,7 +29,7 @@ from firmware.leader.reconstruction import (
     reconstruct_packets,
     states_of_fragment,
 )
-from firmware.leader.settings import LeaderSettings
+from firmware.leader.settings import LeaderSettings, patient_reassembly
 from firmware.leader.trajectory import Trajectory
 from firmware.soundings import Odometry, Ping
 from firmware.submap_builder import SubmapBuilder
@@ -40,7 +40,6 @@ from protocol.packets import Header, SubmapFragment, SubmapPacket, TrajectoryPac
 from protocol.reassembly import (
     FragmentArrived,
     Reassembler,
-    ReassemblySettings,
     SubmapTransfer,
 )
 from protocol.schedule import Slots
@@ -94,7 +93,7 @@ class LeaderCore:
         )
         hops = max(1, round(settings.submaps.duration_s / settings.hop_s))
         self._stretches: deque[Submap] = deque(maxlen=hops)
-        self._reassembler = Reassembler(_patient(settings, slots))
+        self._reassembler = Reassembler(patient_reassembly(settings, slots))
         self._ranging = Ranging(settings.ranges)
         self.fleet = Fleet(self.graph, self._ranging, settings.fleet)
         self._answers = Answers(
@@ -252,7 +251,10 @@ class LeaderCore:
             **self._answers.counters,
             **self._ranging.counters,
             **self._judgement.counters,
-            **{f"reassembly_{k}": v for k, v in _counters_of(self._reassembler).items()},
+            **{
+                f"reassembly_{k}": v
+                for k, v in dataclasses.asdict(self._reassembler.counters).items()
+            },
             "bad_odometry": self._reckoning.bad_samples,
             "bad_beams": self._builder.bad_beams,
             "bad_pings": self._builder.bad_pings,
@@ -346,16 +348,3 @@ class LeaderCore:
         """Let a follower's chain grow by its known track, and use the ranges that this frees."""
         self.fleet.extend(chain)
         self.fleet.use_ranges(chain)
-
-
-def _patient(settings: LeaderSettings, slots: Slots) -> ReassemblySettings:
-    """Return the reassembly's settings: it waits longer where followers have air for repeats."""
-    if settings.answers != "extended":
-        return settings.reassembly
-    room = slots.frames_per_submap(settings.submaps.duration_s)
-    return dataclasses.replace(settings.reassembly, fragments_with_repeats=max(room - 1, 0))
-
-
-def _counters_of(reassembler: Reassembler) -> dict[str, int]:
-    counters = reassembler.counters
-    return {name: getattr(counters, name) for name in counters.__dataclass_fields__}

@@ -1,5 +1,6 @@
 """The configuration of a leader: one frozen tree that gathers the settings of its parts."""
 
+import dataclasses
 from dataclasses import dataclass
 
 from firmware.compression.settings import BinningSettings
@@ -13,6 +14,7 @@ from firmware.leader.reconstruction import ReconstructionSettings
 from firmware.soundings import SonarSettings
 from firmware.submap_builder import SubmapSettings
 from protocol.reassembly import ReassemblySettings
+from protocol.schedule import Slots
 from protocol.settings import Settings, setting
 
 
@@ -49,3 +51,11 @@ class LeaderSettings(Settings):
     hop_s: float = setting(
         20.0, "s", "own sub-maps overlap by half: closures come earlier", minimum=4.0
     )
+
+
+def patient_reassembly(settings: LeaderSettings, slots: Slots) -> ReassemblySettings:
+    """Return the reassembly's settings: it waits longer where followers have air for repeats."""
+    if settings.answers != "extended":
+        return settings.reassembly
+    room = slots.frames_per_submap(settings.submaps.duration_s)
+    return dataclasses.replace(settings.reassembly, fragments_with_repeats=max(room - 1, 0))

@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import functools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -108,7 +109,8 @@ def test_after_the_survey_the_trajectory_goes_out_alone() -> None:
 
 
 def test_small_frames_have_small_trajectories() -> None:
-    core = follower_of(PATH, profile="lattice", **{"compression.small_frames": True})
+    small: dict[str, Any] = {"compression.small_frames": True}
+    core = follower_of(PATH, profile="lattice", **small)
     packets = sent(core, 150.0, sonar_until_s=40.0)
     assert {len(encode(p)) for p in packets} == {62}
     assert isinstance(packets[-1], TrajectoryPacket)

@@ -1,6 +1,7 @@
 """The leader's core, driven by followers' cores and by everything that goes wrong."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from protocol.packets import (
 from tests.leader.vessels import Convoy, convoy, follower_of, leader_of, line, slots_of
 
 
-def frames_of(**changes: object) -> list[tuple[bytes, float]]:
+def frames_of(**changes: Any) -> list[tuple[bytes, float]]:
     """Return what a follower transmits in 100 s, and when."""
     one = convoy(lose=lambda *_: True, **changes).run(0.0, 100.0)
     return [(encode(packet), sent_s) for packet, sent_s in one.up]
@@ -297,7 +298,7 @@ def test_lost_fragments_are_asked_for_and_repeated_where_the_air_has_room() -> N
     def lose_some(packet: Packet, time_s: float) -> bool:
         return packet.header.profile is Profile.SUBMAP_LATTICE and time_s % 28.0 < 4.0
 
-    changes: dict[str, object] = {"profile": "lattice", "frames_per_submap": 3}
+    changes: dict[str, Any] = {"profile": "lattice", "frames_per_submap": 3}
     plain = convoy(answers="paper", lose=lose_some, **changes).run(0.0, 200.0)
     repeated = convoy(answers="extended", lose=lose_some, **changes).run(0.0, 200.0)
     assert repeated.leader.status()["repeats_asked"] > 0

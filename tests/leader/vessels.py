@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -157,7 +158,7 @@ def convoy(
     *,
     answers: str = "paper",
     lose: Callable[[Packet, float], bool] = lambda *_: False,
-    **changes: object,
+    **changes: Any,
 ) -> Convoy:
     """Return a leader and followers on lines beside each other."""
     slots, leader_path = slots_of(followers), line(0.0, 0.0)

@@ -17,6 +17,7 @@ from firmware.leader.swath import Swath
 from firmware.submaps import GriddedSubmap
 from protocol.settings import Settings, setting
 
+_SMOOTHING_CELLS = 0.7  # of slopes, as in the match
 _ITERATIONS = 4  # the shift's prior keeps the fit near its start
 _LONGEST_STEP_M = 3.0  # gradients are not believed farther than their smoothing
 
@@ -122,7 +123,7 @@ def _evidence_of(
     if layers[0] is None or layers[1] is None:
         return None
     reference, query = layers[0], layers[1]
-    fields = fields_of(reference, 0.5), fields_of(query, 0.5)
+    fields = fields_of(reference, _SMOOTHING_CELLS), fields_of(query, _SMOOTHING_CELLS)
     tracks = (
         _basis(overlap.reference_swath, overlap.reference, reference.grid),
         _basis(overlap.query_swath, overlap.query, query.grid),

@@ -83,7 +83,7 @@ class MatchingSettings(Settings):
         1.0, "", "from simulated pairs, so that NEES is 2", minimum=0.1
     )
     slope_smoothing_cells: float = setting(
-        0.7, "cells", "a footprint at 40 m; keeps sounding noise out of the slopes", minimum=0.1
+        0.5, "cells", "keeps sounding noise out of the slopes", minimum=0.1
     )
 
 

@@ -84,9 +84,9 @@ def test_evidence_fades_with_the_water(scene: Scene) -> None:
         calibration.learn(pair, NOISE, 0.0)
     again.learn(pair, NOISE, 1.0)
     late.learn(pair, NOISE, 6000.0)
-    spread = [np.trace(calibration.covariance) for calibration in (once, again, late)]
-    assert spread[2] == pytest.approx(spread[0], rel=0.1)
-    assert spread[1] < 0.9 * spread[0]
+    spread = [np.linalg.eigvalsh(c.covariance)[0] for c in (once, again, late)]
+    assert spread[2] > 0.9 * spread[0]
+    assert spread[1] < 0.8 * spread[0]
 
 
 def test_cells_seen_from_several_headings_are_not_pure(scene: Scene) -> None:

@@ -19,6 +19,7 @@ D = TypeVar("D", bound=np.generic)
 _ROW_STRIDE = 1 << 31  # cells per key row: 2 million km at 1 m
 _CHUNK = 1 << 12  # soundings gathered before they are sorted in: 20 pings, 4 ms
 _SIGMA_PER_MAD = 1.4826
+_LONE_SHARE = 0.1  # of the usual soundings in 5 x 5 cells; an edge of the swath has twice that
 _SMALLEST_SIGMA_M = 0.02  # a noise-free bottom must not gate its own slope away
 
 
@@ -204,7 +205,9 @@ class SoundingBins:
         count: Array = near.sum(axis=1).astype(np.float64) + n_sums
         total = offset.sum(axis=1) + np.where(sums_near, self._sums[:, 0], 0.0)
         squares = (offset**2).sum(axis=1) + np.where(sums_near, self._sums[:, 1], 0.0)
-        kept = count > 0
+        lone = self._lone(self._filled + self._sums[:, 2])
+        self.dropped_fliers += int(count[lone].sum())
+        kept = (count > 0) & ~lone
         count = np.maximum(count, 1.0)
         mean = total / count
         within = np.maximum(squares - count * mean**2, 0.0)
@@ -234,8 +237,16 @@ class SoundingBins:
             spread_m[part][few] = np.maximum(spread_m[part][few], 2.0 * sigma_m)
         return centre_m, spread_m
 
-    def _around(self, keys: NDArray[np.int64], median_m: Array) -> Array:
-        """Return the medians in the 5 x 5 cells around each of the keys, (K, 25), NaN if empty."""
+    def _lone(self, placed: Array) -> NDArray[np.bool_]:
+        """Return which cells lie almost alone: long echoes fall beyond the swath, cell by cell."""
+        crowd = np.empty(self._keys.size)
+        for start in range(0, self._keys.size, _CHUNK):
+            part = slice(start, start + _CHUNK)
+            crowd[part] = np.nansum(self._around(self._keys[part], placed), axis=1)
+        return np.asarray(crowd < _LONE_SHARE * np.median(crowd))
+
+    def _around(self, keys: NDArray[np.int64], values: Array) -> Array:
+        """Return the values in the 5 x 5 cells around each of the keys, (K, 25), NaN if empty."""
         around = np.full((keys.size, 25), np.nan)
         for step in range(5):
             lowest = keys + (step - 2) * _ROW_STRIDE - 2
@@ -243,7 +254,7 @@ class SoundingBins:
             for ahead in range(5):
                 row = np.minimum(at + ahead, self._keys.size - 1)
                 inside = (at + ahead < self._keys.size) & (self._keys[row] <= lowest + 4)
-                around[inside, 5 * step + ahead] = median_m[row[inside]]
+                around[inside, 5 * step + ahead] = values[row[inside]]
         return around
 
 

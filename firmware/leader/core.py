@@ -22,6 +22,7 @@ from firmware.leader.judgement import Judgement
 from firmware.leader.ledger import Anchor
 from firmware.leader.matching import MatchOutcome
 from firmware.leader.own_grid import grid_of
+from firmware.leader.pairing import Calibrations
 from firmware.leader.pose_graph import PoseGraph
 from firmware.leader.ranging import Ranging
 from firmware.leader.reconstruction import (
@@ -99,7 +100,8 @@ class LeaderCore:
         self._answers = Answers(
             boot_epoch, self.fleet, self.graph, extended=settings.answers == "extended"
         )
-        self._judgement = Judgement(settings.judgement, settings.matching)
+        self._calibrations = Calibrations(settings.matching)
+        self._judgement = Judgement(settings.judgement, settings.matching, self._calibrations)
         self._sheets_judged = 0
         self._sheets_to_match: deque[Sheet] = deque(maxlen=16)
         self._ranges_used_s: dict[int, float] = {}
@@ -165,7 +167,12 @@ class LeaderCore:
         self.graph.update()
         sheet = self._sheets_to_match.popleft()
         jobs = jobs_for(
-            sheet, self.atlas, self.graph, self._settings.closures, self._settings.matching
+            sheet,
+            self.atlas,
+            self.graph,
+            self._settings.closures,
+            self._settings.matching,
+            self._calibrations,
         )
         return SheetJobs(sheet=sheet, jobs=tuple(jobs))
 

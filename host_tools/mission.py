@@ -66,7 +66,7 @@ def local_nodes(
         return stored_nodes(settings, vehicles, [deployed(v) for v in vehicles], store)
     slots = Slots(settings.slots)
     originals = Originals(submaps={})
-    rebuild = rebuild_of(baseline, originals, settings.leader.cell_m)
+    rebuild = rebuild_of(baseline, originals, settings.leader.reconstruction.cell_m)
     leader = LeaderCore(
         0, deployed(vehicles[0]), settings=settings.leader, slots=slots, rebuild=rebuild
     )

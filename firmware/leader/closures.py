@@ -1,8 +1,6 @@
 """Loop closures: which pairs of sub-maps to match, and what becomes of what the match finds."""
 
 import enum
-from collections import Counter
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -187,13 +185,6 @@ def gate(closure: Closure, graph: PoseGraph, settings: ClosureSettings) -> bool:
         active=False,
     )
     return True
-
-
-def count_stages(closures: Iterable[Closure]) -> dict[str, int]:
-    """Return how many closures reached each stage last, and how many are active."""
-    closures = list(closures)
-    counts = Counter(closure.stage.value for closure in closures)
-    return {**{s.value: counts[s.value] for s in Stage}, "active": sum(c.active for c in closures)}
 
 
 def _correction(sheet: Sheet, graph: PoseGraph) -> Array:

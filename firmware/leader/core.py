@@ -279,7 +279,7 @@ class LeaderCore:
             self.counters["submaps_too_thin"] += 1
             return
         sheet_id = SheetId(vehicle=LEADER, boot_epoch=self.boot_epoch, submap=submap.index)
-        grid = grid_of(submap.bins, self._settings.cell_m)
+        grid = grid_of(submap.bins, self._settings.reconstruction.cell_m)
         self._add_sheet(sheet_of(sheet_id, submap.track, grid, reconstructed=False))
 
     def _add_transfer(self, transfer: SubmapTransfer) -> None:

@@ -33,7 +33,9 @@ _MAX_POINTS = 600  # ten frames hold fewer; the decoder's matrices are bounded b
 class ReconstructionSettings(Settings):
     """The leader's grid, and which of its cells are kept."""
 
-    cell_m: float = setting(2.0, "m", "the grid of the matching (paper, 6.1)", minimum=0.05)
+    cell_m: float = setting(
+        2.0, "m", "the grid of the matching, own sub-maps too (paper, 6.1)", minimum=0.05
+    )
     max_variance_m2: float = setting(0.1, "m2", "paper, 4.2: above it depths are dropped")
     max_cells: int = setting(
         1_000_000, "cells", "25 MB; a swath at 1 m has 22,500", minimum=100, maximum=10_000_000

@@ -42,9 +42,6 @@ class LeaderSettings(Settings):
         "22 bytes; or `extended`, 42 bytes with variances, own position and what to repeat",
         choices=("paper", "extended"),
     )
-    cell_m: float = setting(
-        2.0, "m", "grid of the matching (paper, 6.1)", minimum=0.25, maximum=50.0
-    )
     atlas_submaps: int = setting(
         5000, "sub-maps", "a day of two vehicles is 4,320", minimum=4, maximum=100_000
     )

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from protocol.packets import MAX_FRAGMENTS, SubmapFragment, SubmapPacket
+from protocol.reassembly import SUBMAPS_MODULO
 from protocol.settings import Settings, setting
 from protocol.timestamps import to_tx_second
 
@@ -44,8 +45,8 @@ class FragmentQueue:
     """Fragments of finished sub-maps in, one packet per slot out.
 
     `counters`: fresh, repeated, and what was ignored: early (a copy was still on its way),
-    exhausted (repeated often enough), unknown (no longer kept), dropped (fresh ones beyond the
-    cap).
+    exhausted (repeated often enough), unknown (no longer kept), overtaken (of no more use), dropped
+    (fresh ones beyond the cap).
     """
 
     def __init__(self, settings: RepeatSettings) -> None:
@@ -78,7 +79,12 @@ class FragmentQueue:
             self._forget(next(iter(self._kept)))
 
     def request(self, submap: int, bitmap: int, asked_s: float) -> None:
-        """Take the leader's wish; asked_s is when its answer was transmitted."""
+        """Take the leader's wish; asked_s is when its answer was transmitted.
+
+        It asks for the oldest sub-map that it still holds open: what was wanted of older ones, or
+        of this one and is not any more, would arrive in vain and make the next repeat late too.
+        """
+        self._drop_overtaken(submap, bitmap)
         kept = self._kept.get(submap)
         for fragment in (i for i in range(MAX_FRAGMENTS) if bitmap >> i & 1):
             if kept is None or fragment not in kept.fragments:
@@ -111,6 +117,16 @@ class FragmentQueue:
         if fragment.header.submap in self._kept:
             self._kept[fragment.header.submap].sent_s[fragment.header.fragment] = now_s
         return replace(fragment, header=replace(fragment.header, tx_second=to_tx_second(now_s)))
+
+    def _drop_overtaken(self, submap: int, bitmap: int) -> None:
+        if not bitmap:
+            return
+        for wanted in list(self._wanted):
+            behind = (submap - wanted[0]) % SUBMAPS_MODULO
+            arrived = behind == 0 and not bitmap >> wanted[1] & 1
+            if arrived or 0 < behind < SUBMAPS_MODULO // 2:
+                del self._wanted[wanted]
+                self.counters["overtaken"] += 1
 
     def _forget(self, submap: int) -> None:
         del self._kept[submap]

@@ -58,6 +58,22 @@ def test_without_free_slots_nothing_is_repeated() -> None:
     assert queue.wanted == 1
 
 
+def test_what_the_leader_has_closed_is_repeated_no_more() -> None:
+    """Else the queue stays too long for ever: each repeat comes after its sub-map was closed."""
+    queue = queue_with(index=0xFFFF)
+    send_all(queue)
+    queue.add([paper_packet(submap=0, fragment=i, count=8) for i in range(8)])
+    send_all(queue, 40.0)
+    queue.request(0xFFFF, 0b111, asked_s=100.0)
+    queue.request(0, 0b1100, asked_s=110.0)
+    assert send_all(queue, 120.0) == [(0, 2), (0, 3)]
+    assert queue.counters["overtaken"] == 3
+    queue.request(0, 0b1_0001, asked_s=200.0)
+    queue.request(0, 0b1_0000, asked_s=210.0)  # fragment 0 has come meanwhile
+    queue.request(0xFFFF, 0, asked_s=210.0)  # an answer that asks for nothing
+    assert send_all(queue, 220.0) == [(0, 4)]
+
+
 def test_a_request_made_before_the_last_copy_could_arrive_is_ignored() -> None:
     queue = queue_with()
     send_all(queue)  # fragment 7 left at 28 s

@@ -30,7 +30,8 @@ class Executive:
     def step(self, now_s: float) -> None:
         """Run what is due; nothing raised by a task passes here."""
         for task in self._tasks:
-            if now_s < self._due_s[task.name] - _EARLY_S:
+            wait_s = self._due_s[task.name] - now_s
+            if _EARLY_S < wait_s <= task.period_s:  # longer: the clock was set back
                 continue
             self._due_s[task.name] = now_s + task.period_s
             began_s = self._stopwatch()

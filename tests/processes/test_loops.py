@@ -98,6 +98,16 @@ def test_tasks_keep_their_periods_and_late_ones_are_counted() -> None:
     assert executive.counters == {"slow_overran": 1}
 
 
+def test_a_clock_that_is_set_back_stops_no_task() -> None:
+    ran: list[float] = []
+    executive = Executive(
+        (Task(name="work", period_s=1.0, deadline_s=1.0, work=ran.append),), lambda: 0.0
+    )
+    for now_s in (3600.0, 3601.0, 2.0, 2.5, 3.0):
+        executive.step(now_s)
+    assert ran == [3600.0, 3601.0, 2.0, 3.0]
+
+
 def test_a_core_is_not_asked_for_frames_while_its_port_is_away() -> None:
     _, modem = loopback()
     asked: list[float] = []

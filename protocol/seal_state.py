@@ -3,15 +3,19 @@
 import json
 import os
 import stat
+from collections.abc import Callable
 from pathlib import Path
+from typing import Protocol, TypeVar
 
 from protocol.errors import ConfigError, LocalProtocolError
 from protocol.seal import KEY_BYTES, LARGEST_COUNTER, Keys
 
-RESERVED_AHEAD = 1024
-"""Counters per write to disk: one write an hour at the paper's rate, 1e6 restarts until the end."""
+RESERVED_AHEAD = 64
+"""Counters per write to disk: one write in four minutes; restarts once a minute outrun no clock."""
 LARGEST_FILE_BYTES = 4096
 """Cap of every file read here; none of ours is longer."""
+
+T = TypeVar("T")
 
 
 def load_keys(path: Path) -> Keys:
@@ -39,12 +43,44 @@ def load_keys(path: Path) -> Keys:
     return Keys(bytes.fromhex(digits))
 
 
-class ReservedCounter:
-    """Counters reserved on disk before use, so that a crash skips some but never repeats one."""
+class Files(Protocol):
+    """The disk under counters and marks; handed in, so that a fault can be."""
 
-    def __init__(self, path: Path, ahead: int = RESERVED_AHEAD) -> None:
-        self._path, self._ahead = path, ahead
-        self._next = self._reserved = self._load()
+    def read(self, path: Path) -> str:
+        """Return a small file's text; raises OSError, or UnicodeDecodeError for damage."""
+
+    def write(self, path: Path, text: str) -> None:
+        """Write a small file so that power loss leaves the old text or the new."""
+
+
+class Disk:
+    """The computer's own files."""
+
+    def read(self, path: Path) -> str:
+        """Return a small file's text."""
+        return _read(path)
+
+    def write(self, path: Path, text: str) -> None:
+        """Write durably."""
+        write_durably(path, text)
+
+
+DISK = Disk()
+
+
+class ReservedCounter:
+    """Counters reserved on disk before use, so that a crash skips some but never repeats one.
+
+    They are kept twice, and a restart takes the higher of what it can read: one damaged file stops
+    nobody. A store that is lost whole begins at `floor`: seconds of a clock, which runs ahead of
+    any sender with less than a frame a second.
+    """
+
+    def __init__(
+        self, path: Path, ahead: int = RESERVED_AHEAD, floor: int = 0, files: Files = DISK
+    ) -> None:
+        self._path, self._ahead, self._files = path, ahead, files
+        self._next = self._reserved = max(self._load(), floor)
 
     def next(self) -> int:
         """Return the next number.
@@ -65,52 +101,74 @@ class ReservedCounter:
         if reserved > LARGEST_COUNTER:
             raise LocalProtocolError(f"counters in {self._path} are used up; change the key")
         try:
-            write_durably(self._path, f"{reserved}\n")
+            for path in _twice(self._path):
+                self._files.write(path, f"{reserved}\n")
         except OSError as error:
             raise LocalProtocolError(f"no counters reserved in {self._path}: {error}") from error
         self._reserved = reserved
 
     def _load(self) -> int:
-        try:
-            text = _read(self._path)
-        except FileNotFoundError:
-            return 0
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"counter file {self._path} cannot be read: {error}") from error
-        if not text.strip().isdecimal() or not 0 <= int(text) <= LARGEST_COUNTER:
+        numbers = _readable(self._path, self._files, _counter)
+        if numbers is None:
             raise ConfigError(
-                f"counter file {self._path} is damaged; counters must never repeat: delete it"
-                " and change the key on all vehicles"
+                f"counter file {self._path} is damaged, and its copy; counters must never repeat:"
+                " delete both and change the key on all vehicles"
             )
-        return int(text)
+        return max(numbers, default=0)
 
 
 class FileMarks:
     """The highest counters accepted, by sender; a receiver that restarts refuses older ones."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path, files: Files = DISK) -> None:
+        self._path, self._files = path, files
         self.failed_writes = 0
 
     def load(self) -> dict[int, int]:
-        """Return the marks; none when the file is not there yet."""
-        try:
-            text = _read(self._path)
-        except FileNotFoundError:
-            return {}
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"{self._path} cannot be read: {error}") from error
-        try:
-            return {int(sender): int(mark) for sender, mark in json.loads(text).items()}
-        except (ValueError, TypeError, AttributeError) as error:
-            raise ConfigError(f"{self._path} is damaged ({error}); delete it") from error
+        """Return the marks, the higher ones of file and copy; none when there is no file yet."""
+        kept = _readable(self._path, self._files, _marks)
+        if kept is None:
+            raise ConfigError(f"{self._path} is damaged, and its copy; delete both")
+        highest: dict[int, int] = {}
+        for marks in kept:
+            for sender, mark in marks.items():
+                highest[sender] = max(mark, highest.get(sender, mark))
+        return highest
 
     def save(self, marks: dict[int, int]) -> None:
         """Keep the marks; a disk that refuses is counted, the link goes on."""
         try:
-            write_durably(self._path, json.dumps(marks))
+            for path in _twice(self._path):
+                self._files.write(path, json.dumps(marks))
         except OSError:
             self.failed_writes += 1
+
+
+def _twice(path: Path) -> tuple[Path, Path]:
+    return path, path.with_name(path.name + ".copy")
+
+
+def _readable(path: Path, files: Files, parse: Callable[[str], T]) -> list[T] | None:
+    """Return what file and copy hold, as far as they can be read; None when none of them can."""
+    found, damaged = [], 0
+    for each in _twice(path):
+        try:
+            found.append(parse(files.read(each)))
+        except FileNotFoundError:
+            continue
+        except (OSError, ValueError, TypeError, AttributeError, OverflowError, RecursionError):
+            damaged += 1
+    return None if damaged and not found else found
+
+
+def _counter(text: str) -> int:
+    if not text.strip().isdecimal() or int(text) > LARGEST_COUNTER:
+        raise ValueError(text)
+    return int(text)
+
+
+def _marks(text: str) -> dict[int, int]:
+    return {int(sender): int(mark) for sender, mark in json.loads(text).items()}
 
 
 def write_durably(path: Path, text: str) -> None:

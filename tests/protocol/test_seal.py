@@ -251,6 +251,48 @@ def test_counters_stop_rather_than_repeat(tmp_path: Path) -> None:
             ReservedCounter(tmp_path / "counter")
 
 
+class Files:
+    """A disk in memory, on which single files can be damaged or lost."""
+
+    def __init__(self) -> None:
+        self.texts: dict[Path, str] = {}
+
+    def read(self, path: Path) -> str:
+        if path not in self.texts:
+            raise FileNotFoundError(path)
+        return self.texts[path]
+
+    def write(self, path: Path, text: str) -> None:
+        self.texts[path] = text
+
+
+@pytest.mark.parametrize("damaged", [0, 1])
+@pytest.mark.parametrize("content", ["", "x", "[" * 4000, '{"1": Infinity}', "-4"])
+def test_one_damaged_file_of_counters_or_marks_stops_nobody(damaged: int, content: str) -> None:
+    files = Files()
+    counter, marks = ReservedCounter(Path("c"), files=files), FileMarks(Path("m"), files)
+    last = [counter.next() for _ in range(200)][-1]
+    marks.save({1: 77})
+    for first in ("c", "m"):
+        files.texts[sorted(p for p in files.texts if p.name[0] == first)[damaged]] = content
+    assert ReservedCounter(Path("c"), files=files).next() > last
+    assert FileMarks(Path("m"), files).load() == {1: 77}
+
+
+def test_counters_of_a_lost_store_begin_at_the_clock() -> None:
+    """A sender that begins at zero again would be refused until it had caught up."""
+    files = Files()
+    counter = ReservedCounter(Path("c"), floor=1000, files=files)
+    opener = Opener(0, KEYS)
+    sealer = Sealer(KEYS, counter)
+    for fragment in range(9):
+        opener.open(decode(sealer.seal(follower_packet(fragment))))
+    files.texts.clear()
+    again = Sealer(KEYS, ReservedCounter(Path("c"), floor=1040, files=files))
+    opener.open(decode(again.seal(follower_packet())))
+    assert opener.accepted == 10
+
+
 def key_file(tmp_path: Path, text: bytes, mode: int = 0o600) -> Path:
     path = tmp_path / "key"
     path.write_bytes(text)

@@ -88,4 +88,5 @@ class ModemPort:
             "modem_dropped": status.dropped_in + status.dropped_out,
             "modem_discarded": status.discarded,
             "modem_reopened": status.reopened,
+            **{f"modem_{name}": count for name, count in status.errors.items()},
         }

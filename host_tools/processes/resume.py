@@ -13,6 +13,7 @@ from firmware.journal import Journal, JournalSettings, Owner
 from firmware.leader.core import LeaderCore
 from firmware.leader.journaled import JournaledLeader
 from firmware.ports import SensorStep
+from host_tools.mission_settings import MissionSettings
 from host_tools.processes.voyage import Voyage
 from protocol.errors import ConfigError
 from protocol.modems.base import ModemEvent, ModemStatus
@@ -30,8 +31,9 @@ class SilentModem:
     """Stands for the modem while a vehicle catches up: nothing is heard, nothing leaves."""
 
     largest_frame_bytes = 256
+    lead_s = 0.0
 
-    def send(self, frame: bytes, now_s: float) -> None:
+    def send(self, frame: bytes, now_s: float, start_s: float | None = None) -> None:
         """Let the frame be."""
 
     def poll(self, now_s: float) -> None:
@@ -68,8 +70,6 @@ def open_core(
 ) -> Journaled:
     """Return a vehicle's core as its store left it, or a new one with a store.
 
-    A store that is ahead of the clock is of an earlier mission: it is set aside.
-
     Raises
     ------
     ConfigError
@@ -78,11 +78,22 @@ def open_core(
     version = metadata.version("fathomlink")
     owner = Owner(vehicle=vehicle, fingerprint=f"{voyage.fingerprint} {version}")
     journal = Journal(store, owner, JournalSettings())
-    core = _core(journal, vehicle, start, voyage)
+    return resumed_core(journal, vehicle, start, voyage.settings, first_s)
+
+
+def resumed_core(
+    journal: Journal,
+    vehicle: int,
+    start: ReckonedState,
+    settings: MissionSettings,
+    first_s: float,
+) -> Journaled:
+    """Return a vehicle's core as its journal left it; one ahead of the clock is set aside."""
+    core = _core(journal, vehicle, start, settings)
     reached_s = core.recorder.last_tick_s
     if reached_s > first_s + 1e-6:
         journal.give_up(f"it had come to {reached_s:g} s, and now it is {first_s:g} s")
-        core = _core(journal, vehicle, start, voyage)
+        core = _core(journal, vehicle, start, settings)
     return core
 
 
@@ -96,8 +107,10 @@ def plain_core(
     return FollowerCore(vehicle, epoch, start, settings=settings.follower, slots=slots)
 
 
-def _core(journal: Journal, vehicle: int, start: ReckonedState, voyage: Voyage) -> Journaled:
-    settings, slots = voyage.settings, Slots(voyage.settings.slots)
+def _core(
+    journal: Journal, vehicle: int, start: ReckonedState, settings: MissionSettings
+) -> Journaled:
+    slots = Slots(settings.slots)
     if vehicle == 0:
         return JournaledLeader(journal, start, settings=settings.leader, slots=slots)
     return JournaledFollower(journal, vehicle, start, settings=settings.follower, slots=slots)

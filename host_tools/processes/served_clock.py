@@ -33,10 +33,15 @@ class StampedModem:
         """The longest frame that the line carries whole."""
         return self._line.largest_frame_bytes
 
-    def send(self, frame: bytes, now_s: float) -> None:
+    @property
+    def lead_s(self) -> float:
+        """A line has none."""
+        return self._line.lead_s
+
+    def send(self, frame: bytes, now_s: float, start_s: float | None = None) -> None:
         """Write a frame to the line."""
         self._written.append(crc32c(frame))
-        self._line.send(frame, now_s)
+        self._line.send(frame, now_s, start_s)
 
     def poll(self, now_s: float) -> None:
         """Move bytes."""

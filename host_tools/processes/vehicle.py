@@ -35,12 +35,14 @@ from host_tools.processes.resume import (
     prepare_store,
     steps_since,
 )
+from host_tools.processes.sealing import seal_of, sealed_voyage
 from host_tools.processes.served_clock import ServedClock, StampedModem
 from host_tools.processes.voyage import Voyage, add_voyage_arguments, voyage_of
 from host_tools.simulator.vehicle import SimulatedVehicle
 from protocol.errors import ConfigError
-from protocol.modems.base import Modem
+from protocol.modems.base import Modem, ModemContext
 from protocol.modems.registry import open_modem
+from protocol.modems.sealed import SealedLink, SealedModem
 
 LEADER = 0
 BOOT_EPOCHS = 16
@@ -67,19 +69,22 @@ def run_vehicle(
     out: Path | None,
     start: str,
     store: Path | None = None,
+    key: Path | None = None,
 ) -> None:
     """Run one vehicle from its clock's first tick to its last, and write its files."""
     if store is not None:
         prepare_store(store)
+    seal = None if key is None else seal_of(vehicle, key, store)
+    sealed = voyage if seal is None else sealed_voyage(voyage)
+    modem, clock = _modem_and_clock(vehicle, modem_url, clock_url, voyage, start, seal)
     files = None if out is None else VehicleFiles(out, vehicle)
     starts = 0 if files is None else files.prepare()
-    modem, clock = _modem_and_clock(vehicle, modem_url, clock_url, voyage, start)
     try:
         ticks = clock.ticks(voyage.tick_s)
         first_s = next(ticks, None)
         if first_s is None:
             return
-        aboard = _board(vehicle, starts, modem, clock, voyage, files, first_s, store)
+        aboard = _board(vehicle, starts, modem, clock, sealed, files, first_s, store)
         _sail(aboard, itertools.chain([first_s], ticks), on_wall=isinstance(clock, WallClock))
         aboard.worker.close()
         if isinstance(aboard.loop.core, Journaled):
@@ -179,16 +184,27 @@ def _catch_up(
 
 
 def _modem_and_clock(
-    vehicle: int, modem_url: str, clock_url: str, voyage: Voyage, start: str
+    vehicle: int,
+    modem_url: str,
+    clock_url: str,
+    voyage: Voyage,
+    start: str,
+    seal: SealedLink | None,
 ) -> tuple[Modem, WallClock | ServedClock]:
+    context = ModemContext() if seal is None else ModemContext(stamp=seal.stamp)
     if clock_url == WALL:
-        modem = open_modem(modem_url)
+        modem = _sealed(open_modem(modem_url, context), seal)
         start_utc_s = start_time_s(start)
         began = datetime.datetime.fromtimestamp(start_utc_s, datetime.UTC)
         print(f"the mission starts at {began:%Y-%m-%d %H:%M:%S} UTC", file=sys.stderr)
         return modem, WallClock(start_utc_s, voyage.settings.scenario.duration_s)
-    stamped = StampedModem(open_modem(modem_url))
-    return stamped, ServedClock(clock_url, vehicle, voyage.fingerprint, stamped)
+    stamped = StampedModem(open_modem(modem_url, context))
+    clock = ServedClock(clock_url, vehicle, voyage.fingerprint, stamped)
+    return _sealed(stamped, seal), clock
+
+
+def _sealed(modem: Modem, seal: SealedLink | None) -> Modem:
+    return modem if seal is None else SealedModem(modem, seal)
 
 
 def start_time_s(text: str) -> float:
@@ -245,6 +261,9 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--store", type=Path, metavar="DIR", help="what a restart resumes from; default: none"
     )
+    parser.add_argument(
+        "--key", type=Path, metavar="FILE", help="seal all frames with this key; needs --store"
+    )
     add_voyage_arguments(parser)
 
 
@@ -269,7 +288,7 @@ def _run_leader(arguments: argparse.Namespace) -> None:
 
 def _run(vehicle: int, arguments: argparse.Namespace, voyage: Voyage) -> None:
     a = arguments
-    run_vehicle(vehicle, a.modem, a.clock, voyage, a.out, a.start, a.store)
+    run_vehicle(vehicle, a.modem, a.clock, voyage, a.out, a.start, a.store, a.key)
 
 
 FOLLOWER = Command(

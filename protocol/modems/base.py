@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Protocol
 from urllib.parse import parse_qsl, urlsplit
 
 from protocol.errors import ConfigError
+from protocol.modems.stamping import Stamp, stamp_frame
 
 if TYPE_CHECKING:
     from protocol.modems.loopback import LoopbackMedium
@@ -85,8 +86,12 @@ class Modem(Protocol):
     def largest_frame_bytes(self) -> int:
         """The longest frame that the modem carries whole."""
 
-    def send(self, frame: bytes, now_s: float) -> None:
-        """Queue a frame; transmission starts at once when the air is this vehicle's."""
+    @property
+    def lead_s(self) -> float:
+        """How long before its second of transmission a frame must be handed over; 0: then."""
+
+    def send(self, frame: bytes, now_s: float, start_s: float | None = None) -> None:
+        """Queue a frame for the second start_s; without one it starts as soon as can be."""
 
     def poll(self, now_s: float) -> None:
         """Move bytes and time; never blocks, never raises."""
@@ -107,6 +112,7 @@ class ModemContext:
 
     now_s: float = 0.0
     tap: Tap | None = None
+    stamp: Stamp = stamp_frame
     medium: "LoopbackMedium | None" = None
 
 

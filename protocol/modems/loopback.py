@@ -36,15 +36,21 @@ class LoopbackMedium:
     def advance(self, now_s: float) -> None:
         """Deliver everything that has been heard by now, in order."""
         for delivery in self.water.deliveries_until(now_s):
-            if self._record is not None:
-                self._record(delivery)
-            modem = self._modems.get(delivery.destination)
-            if modem is not None and delivery.was_received:
-                modem.hear(delivery)
+            self.hand_over(delivery)
+
+    def hand_over(self, delivery: Delivery) -> None:
+        """Give one delivery to the modem of its receiver."""
+        if self._record is not None:
+            self._record(delivery)
+        modem = self._modems.get(delivery.destination)
+        if modem is not None and delivery.was_received:
+            modem.hear(delivery)
 
 
 class LoopbackModem:
     """One node's modem: starts a frame when asked, or when its last one has ended."""
+
+    lead_s = 0.0
 
     def __init__(self, medium: LoopbackMedium, node: int) -> None:
         self._medium = medium
@@ -58,7 +64,7 @@ class LoopbackModem:
         """The longest frame that the modem carries whole."""
         return LARGEST_FRAME_BYTES
 
-    def send(self, frame: bytes, now_s: float) -> None:
+    def send(self, frame: bytes, now_s: float, start_s: float | None = None) -> None:  # noqa: ARG002
         """Transmit now, or after the frame that is on the air."""
         if len(self._queue) == QUEUED_FRAMES:
             self._queue.popleft()

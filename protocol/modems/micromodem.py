@@ -101,4 +101,4 @@ def open_micromodem(url: ModemUrl, context: ModemContext) -> Modem:
         When the port is not there.
     """
     settings = settings_from_url(url, MicroModemSettings())
-    return open_dialect(url, context, settings.baud, lambda: MicroModem(settings))
+    return open_dialect(url, context, settings.baud, lambda: MicroModem(settings, context.stamp))

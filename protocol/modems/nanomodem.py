@@ -351,4 +351,4 @@ def open_nanomodem(url: ModemUrl, context: ModemContext) -> Modem:
         When the port is not there.
     """
     settings = settings_from_url(url, NanomodemSettings())
-    return open_dialect(url, context, settings.baud, lambda: Nanomodem(settings))
+    return open_dialect(url, context, settings.baud, lambda: Nanomodem(settings, context.stamp))

@@ -34,6 +34,8 @@ class SerialLineModem:
     by a vanishing port is sent again from its start.
     """
 
+    lead_s = 0.0
+
     def __init__(self, path: str, baud: int, tap: Tap | None = None) -> None:
         self._path, self._baud, self._tap = path, baud, tap
         self.bytes_read = 0
@@ -50,7 +52,7 @@ class SerialLineModem:
         """The longest frame that the line carries whole: the guard less COBS's overhead."""
         return GUARD_BYTES - 4
 
-    def send(self, frame: bytes, now_s: float) -> None:
+    def send(self, frame: bytes, now_s: float, start_s: float | None = None) -> None:  # noqa: ARG002
         """Queue a frame; when the queue is full the oldest one not yet begun is dropped."""
         if len(self._queue) == QUEUED_FRAMES:
             del self._queue[1 if self._written else 0]

@@ -1,0 +1,47 @@
+"""The seal of a vehicle's process: key file, and counters and marks in its store."""
+
+import dataclasses
+import time
+from pathlib import Path
+
+from host_tools.processes.voyage import Voyage
+from protocol.errors import ConfigError
+from protocol.modems.sealed import SealedLink
+from protocol.seal import Opener, Sealer
+from protocol.seal_state import FileMarks, ReservedCounter, load_keys
+from protocol.settings import replace
+
+COUNTER_ZERO_UTC_S = 1_735_689_600
+"""2025-01-01: counters of a store without any begin at the seconds since then; 32 bits last."""
+
+
+def seal_of(vehicle: int, key: Path, store: Path | None) -> SealedLink:
+    """Return the seal of a vehicle.
+
+    Raises
+    ------
+    ConfigError
+        For a key file that cannot be used, and without a store: counters must outlive a crash.
+    """
+    keys = load_keys(key)
+    if store is None:
+        raise ConfigError("--key needs --store DIR: seal counters must survive a restart")
+    floor = max(0, int(time.clock_gettime(time.CLOCK_REALTIME)) - COUNTER_ZERO_UTC_S)
+    counter = ReservedCounter(store / f"seal_{vehicle}.counter", floor=floor)
+    marks = FileMarks(store / f"seal_{vehicle}.marks")
+    return SealedLink(Sealer(keys, counter), Opener(vehicle, keys, marks))
+
+
+def sealed_voyage(voyage: Voyage) -> Voyage:
+    """Return the voyage with sub-maps that leave a seal its place.
+
+    Raises
+    ------
+    ConfigError
+        For the profiles whose frames have no room.
+    """
+    profile = voyage.settings.follower.profile
+    if profile != "paper":
+        raise ConfigError(f"--key is for --profile paper; a {profile} frame has no room for a seal")
+    plain = replace(voyage.settings, {"follower.compression.parity": False})
+    return dataclasses.replace(voyage, settings=plain)

@@ -4,10 +4,12 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/ready
 FUZZ_SECONDS ?= 10
+LINK_SEEDS ?= 10000
+MISSION_SEEDS ?= 200
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo test slow check bench bench-compression reproduce fuzz hil wheel clean
+.PHONY: demo test slow check bench bench-compression reproduce fuzz faults hil wheel clean
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -49,6 +51,10 @@ reproduce: $(READY)
 fuzz: $(READY)
 	$(BIN)/python -m pip install --quiet --editable ".[fuzz]"
 	$(BIN)/python -m tests.fuzz.run --seconds $(FUZZ_SECONDS)
+
+faults: $(READY)
+	$(BIN)/fathomlink faults --tier link --seeds $(LINK_SEEDS)
+	$(BIN)/fathomlink faults --tier mission --seeds $(MISSION_SEEDS)
 
 wheel: $(READY)
 	sh .ci/wheel

@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 from host_tools import compress_files, config_show, inspector, reproduce, simulate
 from host_tools.commands import Command
 from host_tools.emulators import emulate
+from host_tools.faults import command as faults
 from host_tools.processes import channel, demo, vehicle
 from host_tools.replay import gsf
 from protocol.errors import FathomError
@@ -25,6 +26,7 @@ COMMANDS: tuple[Command, ...] = (
     compress_files.COMPRESS,
     compress_files.RECONSTRUCT,
     emulate.COMMAND,
+    faults.COMMAND,
     gsf.COMMAND,
     inspector.COMMAND,
     config_show.COMMAND,

@@ -1,0 +1,1 @@
+"""Fault simulation: production code of two vehicles while water, modem, clock and disk fail."""

@@ -85,8 +85,8 @@ class ModemPort:
             **self.counters,
             "modem_sent": status.sent,
             "modem_received": status.received,
+            "modem_queued": status.queued,
             "modem_dropped": status.dropped_in + status.dropped_out,
             "modem_discarded": status.discarded,
             "modem_reopened": status.reopened,
-            **{f"modem_{name}": count for name, count in status.errors.items()},
-        }
+        } | {f"modem_{name}": count for name, count in status.errors.items()}

@@ -8,7 +8,14 @@ from typing import NoReturn
 
 from threadpoolctl import threadpool_limits
 
-from host_tools import compress_files, config_show, inspector, reproduce, simulate
+from host_tools import (
+    compress_files,
+    config_show,
+    inspector,
+    link_status,
+    reproduce,
+    simulate,
+)
 from host_tools.commands import Command
 from host_tools.emulators import emulate
 from host_tools.faults import command as faults
@@ -29,6 +36,7 @@ COMMANDS: tuple[Command, ...] = (
     faults.COMMAND,
     gsf.COMMAND,
     inspector.COMMAND,
+    link_status.COMMAND,
     config_show.COMMAND,
 )
 BAD_INPUT = 2

@@ -97,7 +97,7 @@ ReassemblyEvent = FragmentArrived | SubmapTransfer
 
 @dataclass(slots=True, kw_only=True)
 class ReassemblyCounters:
-    """What became of fragments and transfers, for the status line."""
+    """What became of fragments and transfers, for the status line; `open` is how many are."""
 
     accepted: int = 0
     duplicates: int = 0
@@ -108,6 +108,7 @@ class ReassemblyCounters:
     partial: int = 0
     evicted: int = 0
     events_dropped: int = 0
+    open: int = 0
 
 
 @dataclass(slots=True)
@@ -200,6 +201,7 @@ class Reassembler:
                 else:
                     slot.overtaken_at_s = arrival_s
         self._slots[key] = slot
+        self.counters.open = len(self._slots)
         return slot
 
     def _place(self, key: Key, slot: _Slot, packet: Fragment, arrival_s: float) -> None:
@@ -219,6 +221,7 @@ class Reassembler:
 
     def _close(self, key: Key, reason: str) -> None:
         slot = self._slots.pop(key)
+        self.counters.open = len(self._slots)
         if reason == "complete":
             self.counters.complete += 1
         else:

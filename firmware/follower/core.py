@@ -97,8 +97,9 @@ class FollowerCore:
         """Take a frame and, where the modem vouches for it, the arrival of its first bit."""
         try:
             packet = decode(frame)
-        except RemoteProtocolError:
+        except RemoteProtocolError as error:
             self.counters["frames_rejected"] += 1
+            self.counters[f"rejected_{error.cause}"] += 1
             return
         if not isinstance(packet, Answer | ExtendedAnswer) or packet.header.vehicle != 0:
             self.counters["frames_not_for_us"] += 1

@@ -53,7 +53,12 @@ class Outbox:
 
     def status(self) -> dict[str, int]:
         """Return what was queued, repeated and dropped."""
-        return {**self.counters, **{f"fragments_{k}": v for k, v in self._queue.counters.items()}}
+        return {
+            **self.counters,
+            **{f"fragments_{k}": v for k, v in self._queue.counters.items()},
+            "fragments_waiting": self._queue.fresh,
+            "fragments_wanted": self._queue.wanted,
+        }
 
     def _trajectory(self, states: Sequence[ReckonedState], slot_s: float) -> TrajectoryPacket:
         """Return the newest of the states, at the places of their seconds."""

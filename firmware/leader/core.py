@@ -130,8 +130,9 @@ class LeaderCore:
         """Take a frame and, where the modem vouches for it, the arrival of its first bit."""
         try:
             packet = decode(frame)
-        except RemoteProtocolError:
+        except RemoteProtocolError as error:
             self.counters["frames_rejected"] += 1
+            self.counters[f"rejected_{error.cause}"] += 1
             return
         header = packet.header
         if not isinstance(packet, SubmapPacket | SubmapFragment | TrajectoryPacket):

@@ -108,7 +108,11 @@ def _sail(aboard: Aboard, ticks: Iterator[float], *, on_wall: bool) -> None:
             core = aboard.loop.core
             if aboard.files is not None:
                 aboard.files.note(core.belief(), core.reckoned)
-            if on_wall and now_s % STATUS_S == 0.0:
+            if now_s % STATUS_S != 0.0:
+                continue
+            if aboard.files is not None:
+                aboard.files.write_counters(aboard.loop.status())
+            if on_wall:
                 print(_status_line(now_s, aboard.loop.status()), file=sys.stderr)
     except KeyboardInterrupt:
         if not on_wall:

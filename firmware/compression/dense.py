@@ -8,7 +8,7 @@ The fit knows both: it minimises the expected error over the two.
 
 import dataclasses
 import struct
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from dataclasses import dataclass
 from math import comb
 
@@ -111,16 +111,16 @@ def dense_code_steps(
         yield None
         if step is not None and (not packed_at or step.evaluations >= packed_at + _PACK_EVERY):
             packed_at, waiting = step.evaluations, None
-            code = yield from _coded_steps(step, frame, bins, deal)
+            code = yield from _coded_steps(step, frame, bins)
             yield code, step
     if waiting is not None:
-        code = yield from _coded_steps(waiting, frame, bins, deal)
+        code = yield from _coded_steps(waiting, frame, bins)
         yield code, waiting
     return ended
 
 
 def _coded_steps(
-    fitted: FittedPoints, frame: FitFrame, bins: BinnedSoundings, deal: Callable[[Array], Dealing]
+    fitted: FittedPoints, frame: FitFrame, bins: BinnedSoundings
 ) -> Generator[None, None, DenseCode]:
     """Quantise positions, fit the depths anew to where they lie now, and quantise those."""
     order = np.argsort(fitted.fragment, kind="stable")
@@ -130,7 +130,7 @@ def _coded_steps(
     origin = np.float32(low).astype(np.float64)
     levels = np.clip(np.round((fitted.position_m + frame.origin_m - origin) / step), 0, _LEVELS)
     at_m = levels * step + origin - frame.origin_m
-    fitted = yield from moved_steps(fitted, at_m, frame, deal)
+    fitted = yield from moved_steps(fitted, at_m, frame)
     depth_m = fitted.depth_m + frame.mean_depth_m
     depth0 = float(np.float32(depth_m.min()))
     depth_step = float(np.float32(max(float(np.ptp(depth_m)) / (_LEVELS - 1), 1e-6)))

@@ -26,6 +26,7 @@ from firmware.compression.losses import LossPatterns
 from firmware.geometry import Array
 
 _ROW_WORK = 1024 * 150**2  # rows x points^2 of a step: under 10 ms
+_ROUNDING = 1e-14  # of a Gram matrix in double precision
 
 Float32 = NDArray[np.float32]
 T = TypeVar("T")
@@ -54,10 +55,18 @@ class ExpectedError:
         fragment: NDArray[np.intp],
         ridge: float,
     ) -> None:
-        self._position_m = position_m.astype(np.float32)
-        self._depth_m = depth_m.astype(np.float32)
-        self._weight = (weight / weight.sum()).astype(np.float32)
-        self.total_m2 = float(np.dot(self._weight, depth_m**2))
+        weight = weight / weight.sum()
+        self.total_m2 = float(np.dot(weight, depth_m**2))
+        points = len(fragment)
+        height = max(128, _ROW_WORK // points**2)
+        room = np.empty((3, len(depth_m), points), dtype=np.float32)
+        weighted = np.empty((min(height, len(depth_m)), points))
+        spare = np.empty(weighted.shape, dtype=np.float32)
+        parts = [slice(start, start + height) for start in range(0, len(depth_m), height)]
+        self._rows = [
+            _Rows(position_m[part], depth_m[part], weight[part], room[:, part], weighted, spare)
+            for part in parts
+        ]
         self._kernel = kernel
         self._no_loss = patterns.no_loss
         self._groups = _groups(patterns, fragment)
@@ -82,19 +91,11 @@ class ExpectedError:
         self.evaluations += 1
         b = float(np.exp(log_b))
         points = point_m.astype(np.float32)
-        rows: list[_Rows] = []
         gram, moment = np.zeros((len(points), len(points))), np.zeros(len(points))
-        height = max(128, _ROW_WORK // len(points) ** 2)
-        for start in range(0, len(self._depth_m), height):
-            part = slice(start, start + height)
-            squared = squared_distance(self._position_m[part], points, b)
-            k, slope = correlation_and_slope(self._kernel, squared)
-            exact = k.astype(np.float64)  # float32 sums lose the small differences beta lives on
-            weighted = exact * self._weight[part, None]
-            gram += weighted.T @ exact
-            moment += weighted.T @ self._depth_m[part]
-            if gradient:
-                rows.append(_Rows(part=part, k=k, slope=slope))
+        for rows in self._rows:
+            rows.measure(self._kernel, points, b)
+            gram += rows.weighted.T @ rows.weighted
+            moment += rows.weighted.T @ rows.target
             yield
         inner = yield from self._solved_steps(point_m, b, gram, moment)
         if not gradient:
@@ -103,15 +104,10 @@ class ExpectedError:
         by_position, by_log_b = inner.evaluation.by_position, inner.evaluation.by_log_b
         stack = inner.stack.astype(np.float32)
         low_rank = (2.0 * inner.stack * inner.probability).astype(np.float32).T
-        for row in rows:
-            misfit = row.k @ stack
-            misfit -= self._depth_m[row.part, None]
-            misfit *= self._weight[row.part, None]
-            pull = misfit @ low_rank
-            pull *= row.slope
-            here = self._position_m[row.part]
-            by_position += (b * b) * (pull.T @ here - pull.sum(axis=0)[:, None] * points)
-            by_log_b -= float(np.vdot(pull, squared_distance(here, points, b)))
+        for rows in self._rows:
+            by_point, by_scale = rows.pulled(stack, low_rank, points)
+            by_position += (b * b) * by_point
+            by_log_b -= by_scale
             yield
         return dataclasses.replace(inner.evaluation, by_position=by_position, by_log_b=by_log_b)
 
@@ -124,27 +120,17 @@ class ExpectedError:
         lower, nugget, failed = factorised(np.array(k), NUGGET)
         self.failed_factorisations += failed
         k = k + nugget * np.eye(len(point_m))
-        inverse = cho_solve((lower, True), np.eye(len(point_m)))
         yield
-        blocks = [_Block.of(group, inverse) for group in self._groups]
-        beta = self._best_weights(gram, moment, inverse, lower, blocks)
-        yield
-        probability = np.concatenate([[self._no_loss], *(block.probability for block in blocks)])
-        lost = [np.zeros((len(beta), 1)), *(block.weights_lost(beta) for block in blocks)]
-        correction = inverse @ np.hstack(lost)
-        stack = beta[:, None] - correction
-        fitted = gram @ stack
+        if self._groups:
+            beta, stack, by_k = yield from self._weights_under_losses(gram, moment, lower)
+        else:
+            beta = self._weights_without_loss(gram, moment, k)
+            stack, by_k = beta[:, None], np.zeros_like(k)
+        probability = np.concatenate([[self._no_loss], *(p for _, p in self._groups)])
         error = self.total_m2 + self._ridge * float(beta @ k @ beta)
-        error += float(probability @ (np.einsum("mp,mp->p", stack, fitted) - 2.0 * moment @ stack))
-        # the points' own K enters through Q, that is through the corrections
-        pull = 2.0 * probability * (fitted - moment[:, None])
-        spread = inverse @ pull
-        first = 1
-        for block in blocks:
-            columns = slice(first, first + len(block.probability))
-            pull[:, columns] -= block.padded(block.solved(spread[:, columns]))
-            first += len(block.probability)
-        by_k = (inverse @ pull) @ correction.T + self._ridge * np.outer(beta, beta)
+        fitted = np.einsum("mp,mp->p", stack, gram @ stack)
+        error += float(probability @ (fitted - 2.0 * moment @ stack))
+        by_k += self._ridge * np.outer(beta, beta)
         by_k = (by_k + by_k.T) * slope
         evaluation = Evaluation(
             error_m2=error,
@@ -153,6 +139,37 @@ class ExpectedError:
             depth_m=k @ beta,
         )
         return _Inner(evaluation=evaluation, stack=stack, probability=probability)
+
+    def _weights_without_loss(self, gram: Array, moment: Array, k: Array) -> Array:
+        """Return the beta of least error when every point arrives."""
+        lower, _, failed = factorised(gram + self._ridge * k, _ROUNDING * float(np.trace(gram)))
+        self.failed_factorisations += failed
+        return np.asarray(cho_solve((lower, True), moment))
+
+    def _weights_under_losses(
+        self, gram: Array, moment: Array, lower: Array
+    ) -> Generator[None, None, tuple[Array, Array, Array]]:
+        """Return the best beta, the weights under each pattern (M, P), and the error's by_k.
+
+        The points' own K enters through Q, that is through the corrections of the weights.
+        """
+        inverse = cho_solve((lower, True), np.eye(len(moment)))
+        yield
+        blocks = [_Block.of(group, inverse) for group in self._groups]
+        beta = self._best_weights(gram, moment, inverse, lower, blocks)
+        yield
+        probability = np.concatenate([[self._no_loss], *(block.probability for block in blocks)])
+        lost = [np.zeros((len(beta), 1)), *(block.weights_lost(beta) for block in blocks)]
+        correction = inverse @ np.hstack(lost)
+        stack = beta[:, None] - correction
+        pull = 2.0 * probability * (gram @ stack - moment[:, None])
+        spread = inverse @ pull
+        first = 1
+        for block in blocks:
+            columns = slice(first, first + len(block.probability))
+            pull[:, columns] -= block.padded(block.solved(spread[:, columns]))
+            first += len(block.probability)
+        return beta, stack, (inverse @ pull) @ correction.T
 
     def _best_weights(
         self, gram: Array, moment: Array, inverse: Array, lower: Array, blocks: "list[_Block]"
@@ -179,13 +196,42 @@ class ExpectedError:
         return beta
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class _Rows:
-    """Kernel rows kept between the two passes over the cells."""
+    """Some cells, and their kernel rows (R, M) kept between the two passes."""
 
-    part: slice
-    k: Float32
-    slope: Float32
+    def __init__(
+        self,
+        position_m: Array,
+        depth_m: Array,
+        weight: Array,
+        room: Float32,
+        weighted: Array,
+        spare: Float32,
+    ) -> None:
+        self._position_m = position_m.astype(np.float32)
+        self._depth_m = depth_m[:, None].astype(np.float32)
+        self._weight = weight[:, None].astype(np.float32)
+        self._root = np.sqrt(weight)
+        self._squared, self._k, self._slope = room
+        self.weighted = weighted[: len(depth_m)]  # shared by all rows, for the pass that fills it
+        self._spare = spare[: len(depth_m)]  # likewise
+        self.target = self._root * depth_m
+
+    def measure(self, kernel: Kernel, points: Float32, b: float) -> None:
+        """Fill the rows for these points; float32 sums would lose what beta lives on."""
+        squared_distance(self._position_m, points, b, self._squared, self._spare)
+        self._k, self._slope = correlation_and_slope(kernel, self._squared, self._k, self._slope)
+        np.multiply(self._k, self._root[:, None], out=self.weighted)
+
+    def pulled(self, stack: Float32, low_rank: Float32, points: Float32) -> tuple[Array, float]:
+        """Return the error's change by points (M, 2), over b^2, and by -log b."""
+        misfit = self._k @ stack
+        misfit -= self._depth_m
+        misfit *= self._weight
+        pull = np.matmul(misfit, low_rank, out=self._spare)
+        pull *= self._slope
+        by_point = pull.T @ self._position_m - pull.sum(axis=0)[:, None] * points
+        return by_point.astype(np.float64), float(np.vdot(pull, self._squared))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -29,6 +29,7 @@ class FittedPoints:
     position_m: Array
     depth_m: Array
     fragment: NDArray[np.intp]
+    patterns: LossPatterns
     b_per_m: float
     kernel: Kernel
     error_m2: float
@@ -50,8 +51,8 @@ class FitFrame:
     ridge: float
 
 
-def fit_frame(bins: BinnedSoundings, max_rows: int) -> FitFrame:
-    """Return the cells about their centre, weighted by how well each is known.
+def fit_frame(bins: BinnedSoundings, max_rows: int, about: FitFrame | None = None) -> FitFrame:
+    """Return the cells about their centre, or another frame's, weighted by how well each is known.
 
     The ridge is the noise of a cell over the variance of depth, as in the regression of Eq. 5.
     """
@@ -59,8 +60,8 @@ def fit_frame(bins: BinnedSoundings, max_rows: int) -> FitFrame:
     every = max(1, -(-len(position_m) // max_rows))
     position_m, depth_m = position_m[::every], bins.depth_m[::every]
     variance_m2 = np.maximum(bins.variance_m2[::every], 1e-6)
-    origin_m = np.median(position_m, axis=0)
-    mean_depth_m = float(np.float32(depth_m.mean()))
+    origin_m = about.origin_m if about else np.median(position_m, axis=0)
+    mean_depth_m = about.mean_depth_m if about else float(np.float32(depth_m.mean()))
     typical = float(np.median(variance_m2))
     spread = max(float(depth_m.var()), 1e-6)
     return FitFrame(
@@ -141,6 +142,7 @@ def fit_steps(
             position_m=point_m,
             depth_m=result.depth_m,
             fragment=fragment,
+            patterns=patterns,
             b_per_m=float(np.exp(log_b)),
             kernel=kernel,
             error_m2=step.value,
@@ -150,7 +152,7 @@ def fit_steps(
 
     x0 = np.append(np.zeros(2 * (len(start_m) - held)), log_b)
     steps = minimise_steps(
-        objective, x0, evaluations=max(settings.iterations, 1), first_move=0.1, largest_move=0.5
+        objective, x0, evaluations=max(settings.iterations, 1), first_move=0.2, largest_move=0.5
     )
     while True:
         try:
@@ -161,7 +163,7 @@ def fit_steps(
 
 
 def moved_steps(
-    fitted: FittedPoints, position_m: Array, frame: FitFrame, deal: Dealer
+    fitted: FittedPoints, position_m: Array, frame: FitFrame
 ) -> Generator[None, None, FittedPoints]:
     """Move the points to positions (M, 2); the generator's value has the best depths there."""
     problem = ExpectedError(
@@ -169,7 +171,7 @@ def moved_steps(
         frame.depth_m,
         frame.weight,
         fitted.kernel,
-        deal(fitted.position_m).patterns,
+        fitted.patterns,
         fitted.fragment,
         frame.ridge,
     )

@@ -28,7 +28,7 @@ def fitc_steps(
     problem = Fitc(frame.position_m, frame.depth_m, kernel)
     log_c = float(np.log(max(frame.depth_m.var(), 1e-8)))
     offset = np.array([-np.log(2.0 * spacing_m), log_c, log_c - np.log(20.0)])
-    fragment = deal(start_m).fragment
+    dealing = deal(start_m)
 
     def parameters(x: Array) -> FitcParameters:
         logs = offset + np.clip(x[-3:], [-3.0, -_LOG_RANGE, -_LOG_RANGE], [3.0, 3.0, 3.0])
@@ -67,7 +67,8 @@ def fitc_steps(
         yield FittedPoints(
             position_m=found.point_m,
             depth_m=result.depth_m,
-            fragment=fragment,
+            fragment=dealing.fragment,
+            patterns=dealing.patterns,
             b_per_m=float(np.exp(found.log_b)),
             kernel=kernel,
             error_m2=step.value,

@@ -30,29 +30,54 @@ def correlation(kernel: Kernel, squared: FloatArray) -> FloatArray:
     return correlation_and_slope(kernel, squared)[0]
 
 
-def correlation_and_slope(kernel: Kernel, squared: FloatArray) -> tuple[FloatArray, FloatArray]:
+def correlation_and_slope(
+    kernel: Kernel,
+    squared: FloatArray,
+    k: FloatArray | None = None,
+    slope: FloatArray | None = None,
+) -> tuple[FloatArray, FloatArray]:
     """Return the correlation k and the slope -2 dk/d(s^2), both of the shape of `squared`.
 
     With s = b d, dk/dz = slope b^2 (x - z) for a point z, and dk/d(log b) = -slope s^2. The slope
-    of the exponential kernel is singular at zero distance and is held there.
+    of the exponential kernel is singular at zero distance and is held there. Room for both may be
+    given: fresh pages cost as much as the arithmetic.
     """
+    floor = squared.dtype.type(_EXPONENT_FLOOR)
     if kernel is Kernel.SQUARED_EXPONENTIAL:
-        k = np.exp(np.maximum(-0.5 * squared, _EXPONENT_FLOOR))
+        k = np.multiply(squared, -0.5, out=k)
+        np.exp(np.maximum(k, floor, out=k), out=k)
         return k, k
-    s = np.sqrt(squared)
+    k = np.sqrt(squared, out=k)
     if kernel is Kernel.MATERN32:
-        s *= -np.sqrt(3.0).astype(s.dtype)
-        e = np.exp(np.maximum(s, _EXPONENT_FLOOR))
-        return (1.0 - s) * e, 3.0 * e
-    k = np.exp(np.maximum(-0.5 * s, _EXPONENT_FLOOR))
-    return k, 0.5 * k / np.maximum(s, 1e-4)
+        k *= -np.sqrt(3.0).astype(k.dtype)
+        slope = np.maximum(k, floor, out=slope)
+        np.exp(slope, out=slope)
+        np.subtract(1.0, k, out=k)
+        k *= slope
+        slope *= 3.0
+        return k, slope
+    slope = np.maximum(k, 1e-4, out=slope)
+    k *= -0.5
+    np.exp(np.maximum(k, floor, out=k), out=k)
+    np.divide(k, slope, out=slope)
+    slope *= 0.5
+    return k, slope
 
 
-def squared_distance(left_m: FloatArray, right_m: FloatArray, b: float) -> FloatArray:
-    """Return b^2 |x - z|^2 for all pairs of left (N, 2) and right (M, 2), as (N, M)."""
-    squared = np.subtract.outer(left_m[:, 0], right_m[:, 0])
+def squared_distance(
+    left_m: FloatArray,
+    right_m: FloatArray,
+    b: float,
+    squared: FloatArray | None = None,
+    spare: FloatArray | None = None,
+) -> FloatArray:
+    """Return b^2 |x - z|^2 for all pairs of left (N, 2) and right (M, 2), as (N, M).
+
+    Room for the result, and as much to spare, may be given.
+    """
+    squared = np.subtract.outer(left_m[:, 0], right_m[:, 0], out=squared)
     squared *= squared
-    east = np.subtract.outer(left_m[:, 1], right_m[:, 1])
+    east = np.subtract.outer(left_m[:, 1], right_m[:, 1], out=spare)
     east *= east
     squared += east
     squared *= left_m.dtype.type(b * b)

@@ -40,6 +40,13 @@ class Field:
     spectrum_m2: Array
     noise_m2: float  # of the mean of a cell, typical
 
+    def depth_m(self, position_m: Array) -> Array:
+        """Return the depth at positions (N, 2)."""
+        trend_m = self.trend.depth_m(self.frame.nodes_of(position_m), self.frame)
+        nodes_m = surface_m(self.coefficients_m).ravel()
+        out: Array = interpolation(self.frame, position_m) @ nodes_m + trend_m
+        return out
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trend:

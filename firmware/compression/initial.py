@@ -13,8 +13,8 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 from firmware.geometry import Array
 
 _LLOYD_STEPS = 8
-_ROUGHNESS_POWER = 0.7  # 0 spreads evenly; 1 starves smooth parts
-_RIM_SHARE = 0.16  # of the points; nearly the share an even spread puts there
+_ROUGHNESS_POWER = 0.9  # 0 spreads evenly; much above 1 starves smooth parts
+_RIM_SHARE = 0.1  # of the points: a rectangle needs four, a ragged edge some more
 
 
 def roughness(position_m: Array, depth_m: Array) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 from firmware.geometry import Array
 
 T = TypeVar("T")
-_PAIRS = 12  # of past steps; more brings nothing within tens of evaluations
+_PAIRS = 30  # of past steps; more brings nothing within tens of evaluations
 _SUFFICIENT = 1e-4  # Armijo
 _SHORTENINGS = 8  # of one step, then the search has failed
 

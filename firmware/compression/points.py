@@ -28,6 +28,7 @@ from firmware.compression.results import (
     FitReport,
 )
 from firmware.compression.settings import CompressionSettings
+from firmware.compression.smoothing import smoothed_steps
 from firmware.geometry import Array
 from firmware.submaps import BinnedSoundings
 from protocol.errors import EstimationError
@@ -53,10 +54,20 @@ def compress_point_steps(
     bins = usable(bins)
     best = unfitted(bins, settings)
     yield best
-    cells = coarsened(bins, settings.fit_cell_m)
+    expected = settings.method != "fitc"
+    targets = bins
+    if expected:
+        for smoothing in stepping(smoothed_steps(bins, settings.fit_cell_m)):
+            targets = smoothing or targets
+            yield best
+    cells = coarsened(targets, settings.fit_cell_m)
     count = min(PAPER_FRAGMENTS * PAPER_POINTS, cells.depth_m.size)
-    frame = fit_frame(cells, settings.max_fit_rows)
-    fit = fitc_steps if settings.method == "fitc" else fit_steps
+    fine = fit_frame(cells, settings.max_fit_rows)
+    frame = fine
+    if expected:
+        coarse = coarsened(targets, settings.placing_cell_m)
+        frame = fit_frame(coarse, settings.max_fit_rows, fine)
+    fit = fit_steps if expected else fitc_steps
     steps = fit(frame, count, settings, dealt_evenly(PAPER_FRAGMENTS, settings))
     waiting: FittedPoints | None = None
     packed_at = 0
@@ -72,10 +83,10 @@ def compress_point_steps(
         waiting = step or waiting
         if step is not None and (not packed_at or step.evaluations >= packed_at + _PACK_EVERY):
             packed_at, waiting = step.evaluations, None
-            best = yield from _pack_steps(step, frame, bins, best, settings)
+            best = yield from _pack_steps(step, fine, bins, best, settings)
         yield best
     if waiting is not None:
-        best = yield from _pack_steps(waiting, frame, bins, best, settings)
+        best = yield from _pack_steps(waiting, fine, bins, best, settings)
     yield dataclasses.replace(best, report=dataclasses.replace(best.report, ended=ended))
 
 
@@ -150,8 +161,7 @@ def _pack_steps(
     mean_depth_m = float(flagged(frame.mean_depth_m, steps))
     if steps is not None:
         rounded_m = without_parity(points, steps)[:, :2] - frame.origin_m
-        deal = dealt_evenly(PAPER_FRAGMENTS, settings)
-        for moving in stepping(moved_steps(fitted, rounded_m, frame, deal)):
+        for moving in stepping(moved_steps(fitted, rounded_m, frame)):
             fitted = moving or fitted
             yield before
         points = without_parity(_absolute(fitted, frame), steps)

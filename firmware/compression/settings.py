@@ -51,11 +51,14 @@ class CompressionSettings(Settings):
     fit_cell_m: float = setting(
         2.0, "m", "ten times fewer rows than soundings for 3-5 % of the error", minimum=0.1
     )
+    placing_cell_m: float = setting(
+        3.0, "m", "of the smoothed cells that place points: a third of their spacing", minimum=0.1
+    )
     max_fit_rows: int = setting(
         4096, "rows", "bounds memory and the longest step", minimum=64, maximum=65536
     )
     iterations: int = setting(
-        28, "evaluations", "0.3 s of one core; the error is then within 5 % of settled", minimum=0
+        40, "evaluations", "0.15 s of one core; the error is then within 5 % of settled", minimum=0
     )
     dense_iterations: int = setting(
         12, "evaluations", "of `dense`, each four times dearer than one of `paper`", minimum=0

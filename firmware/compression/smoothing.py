@@ -1,0 +1,29 @@
+"""Cells freed of noise before points are fitted to them.
+
+A few hundred points fitted to noisy cells follow the noise where they can. Fitted to the field's
+posterior mean (`firmware.compression.field`) they do not, and far fewer cells are needed.
+"""
+
+import dataclasses
+from collections.abc import Generator
+
+import numpy as np
+
+from firmware.compression.binning import coarsened
+from firmware.compression.field import fitted_field_steps, fitted_trend
+from firmware.compression.lattice_frame import lattice_frame
+from firmware.submaps import BinnedSoundings
+
+
+def smoothed_steps(bins: BinnedSoundings, step_m: float) -> Generator[None, None, BinnedSoundings]:
+    """Estimate the field on nodes every step_m; the value is the cells with its depths.
+
+    Cells spread so far that their lattice would be coarser than that stay as measured.
+    """
+    cells = coarsened(bins, step_m)
+    frame = lattice_frame(cells, step_m)
+    if frame.step_m > 1.5 * step_m:
+        return bins
+    field = yield from fitted_field_steps(cells, frame, fitted_trend(cells, frame))
+    position_m = np.column_stack([bins.north_m, bins.east_m])
+    return dataclasses.replace(bins, depth_m=field.depth_m(position_m))

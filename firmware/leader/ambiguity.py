@@ -92,6 +92,36 @@ def log_evidence(
     return np.where(usable, np.maximum(cells, 0.0) * relief.information_per_cell, -np.inf)
 
 
+def tempered_evidence(surface: ErrorSurface, relief: Relief, correlated_cells: float) -> Array:
+    """Return a cautious log Bayes factor of a match at each shift, for pairs that decide nothing.
+
+    Half of the information that the overlap offers, less the misfit, for which correlated_cells
+    cells count as one. Unlike `log_evidence` it makes a larger overlap pay for every cell that
+    does not fit, so that its moments stay honest where the relief is faint.
+    """
+    usable = np.isfinite(surface.residual_m2)
+    error = np.where(usable, surface.residual_m2 / surface.noise_m2, np.inf) / relief.noise_scale
+    cells = np.minimum(surface.overlap_cells, relief.coherent_cells)
+    misfit = (
+        surface.overlap_cells
+        * np.where(usable, np.maximum(error - 1.0, 0.0), 0.0)
+        / (2.0 * correlated_cells)
+    )
+    evidence = 0.5 * relief.information_per_cell * cells - misfit
+    return np.where(usable, np.maximum(evidence, 0.0), -np.inf)
+
+
+def moments(found: Posterior, prior_m: Array, covariance_m2: Array) -> tuple[Array, Array]:
+    """Return mean (2,) and covariance (2, 2) of the shift; what lies outside is as the prior."""
+    north, east = found.north_m - prior_m[0], found.east_m - prior_m[1]
+    by_north, by_east = found.mass.sum(axis=1), found.mass.sum(axis=0)
+    mean = np.array([by_north @ north, by_east @ east])
+    crossed = float(north @ found.mass @ east)
+    second = np.array([[by_north @ north**2, crossed], [crossed, by_east @ east**2]])
+    second += found.outside * covariance_m2
+    return prior_m + mean, second - np.outer(mean, mean)
+
+
 def posterior(
     surface: ErrorSurface, evidence: Array, prior_m: Array, covariance_m2: Array, null_share: float
 ) -> Posterior:

@@ -8,7 +8,7 @@ import numpy as np
 from firmware.geometry import Array
 from firmware.leader.atlas import Atlas, Sheet, SheetId, overlap_m2
 from firmware.leader.ledger import Anchor
-from firmware.leader.matching import MatchingSettings, MatchOutcome, match
+from firmware.leader.matching import Hint, MatchingSettings, MatchOutcome, match
 from firmware.leader.pairing import Calibrations, side_of
 from firmware.leader.pose_graph import PoseGraph
 from firmware.submaps import GriddedSubmap
@@ -30,6 +30,15 @@ class ClosureSettings(Settings):
     )
     expected_overlap_m2: float = setting(
         300.0, "m^2", "mean over the prior; a match needs 480 m^2", minimum=0.0
+    )
+    hint_prior_m: float = setting(
+        8.0,
+        "m",
+        "an offset known better than so learns nothing from an ambiguous pair",
+        minimum=0.0,
+    )
+    hint_span_s: float = setting(
+        40.0, "s", "dead reckoning between the overlap and the middles of the sub-maps", minimum=0.0
     )
     gate_chi_square: float = setting(
         13.8, "1", "99.9 % of true innovations of two components pass", minimum=1.0
@@ -162,6 +171,27 @@ def closure_of(
         axis_deg=found.axis_deg,
         origin_reckoned_m=job.origin.reckoned_at(found.reference_time_s),
         target_reckoned_m=job.target.reckoned_at(found.query_time_s),
+    )
+
+
+def enter_hint(
+    job: MatchJob, hint: Hint, graph: PoseGraph, settings: ClosureSettings
+) -> int | None:
+    """Let a hint lean on the estimate; return its number, None where the graph knows as much.
+
+    Raises EstimationError where a sub-map hangs on no node.
+    """
+    if np.linalg.eigvalsh(job.prior_covariance_m2)[-1] < settings.hint_prior_m**2:
+        return None
+    walk_m2 = job.settings.walk_m2_per_s * settings.hint_span_s
+    return graph.add_closure(
+        _anchor(job.origin, graph),
+        _anchor(job.target, graph),
+        job.target.reckoned_at(job.target.time_s)
+        + hint.shift_m
+        - job.origin.reckoned_at(job.origin.time_s),
+        hint.covariance_m2 + walk_m2 * np.eye(2),
+        active=True,
     )
 
 

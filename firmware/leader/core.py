@@ -16,7 +16,7 @@ from firmware.belief import Belief
 from firmware.dead_reckoning import DeadReckoning, ReckonedState
 from firmware.leader.answers import Answers
 from firmware.leader.atlas import LEADER, Atlas, Sheet, SheetId, sheet_of
-from firmware.leader.closures import Closure, MatchJob, closure_of, gate, jobs_for
+from firmware.leader.closures import Closure, MatchJob, closure_of, enter_hint, gate, jobs_for
 from firmware.leader.fleet import Fleet
 from firmware.leader.judgement import Judgement
 from firmware.leader.ledger import Anchor
@@ -184,6 +184,10 @@ class LeaderCore:
             if outcome.reason is not None:
                 self.counters[f"match_{outcome.reason.name.lower()}"] += 1
             try:
+                if outcome.hint is not None:
+                    self._judgement.note_hint(
+                        enter_hint(job, outcome.hint, self.graph, self._settings.closures)
+                    )
                 closure = closure_of(job, outcome, self.graph, now_s)
                 if closure is None:
                     continue

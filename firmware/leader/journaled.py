@@ -18,7 +18,7 @@ from firmware.dead_reckoning import ReckonedState
 from firmware.inputs import Heard, Kind, from_state, to_instant, to_state
 from firmware.journal import Journal, StoreUnusableError
 from firmware.leader.core import LeaderCore, SheetJobs
-from firmware.leader.matches import Match, MatchOutcome, NoMatch
+from firmware.leader.matches import Hint, Match, MatchOutcome, NoMatch
 from firmware.leader.settings import LeaderSettings
 from firmware.recorder import Recorder
 from firmware.soundings import Odometry, Ping
@@ -169,8 +169,8 @@ class JournaledLeader(LeaderCore):
 def from_outcomes(outcomes: Sequence[MatchOutcome], now_s: float) -> bytes:
     """Return outcomes and the time of their judgement as bytes; numbers read back exactly."""
     rows = [
-        _columns(outcome.match) if outcome.match else (outcome.reason or NoMatch.EMPTY).name
-        for outcome in outcomes
+        (_columns(o.match), _columns(o.hint), None if o.reason is None else o.reason.name)
+        for o in outcomes
     ]
     return _NOW.pack(now_s) + json.dumps(rows, separators=(",", ":")).encode()
 
@@ -179,20 +179,25 @@ def to_outcomes(body: bytes) -> tuple[list[MatchOutcome], float]:
     """Return the outcomes and the time of bytes."""
     (now_s,) = _NOW.unpack_from(body)
     outcomes = []
-    for row in json.loads(body[_NOW.size :]):
-        if isinstance(row, str):
-            outcomes.append(MatchOutcome(match=None, reason=NoMatch[row]))
-            continue
-        values: dict[str, Any] = {
-            name: np.array(value) if isinstance(value, list) else value
-            for name, value in row.items()
-        }
-        outcomes.append(MatchOutcome(match=Match(**values), reason=None))
+    for found, hint, reason in json.loads(body[_NOW.size :]):
+        outcomes.append(
+            MatchOutcome(
+                match=None if found is None else Match(**_values(found)),
+                reason=None if reason is None else NoMatch[reason],
+                hint=None if hint is None else Hint(**_values(hint)),
+            )
+        )
     return outcomes, now_s
 
 
-def _columns(found: Match) -> dict[str, object]:
-    return {field.name: _plain(getattr(found, field.name)) for field in dataclasses.fields(Match)}
+def _columns(found: Match | Hint | None) -> dict[str, object] | None:
+    if found is None:
+        return None
+    return {field.name: _plain(getattr(found, field.name)) for field in dataclasses.fields(found)}
+
+
+def _values(columns: dict[str, Any]) -> dict[str, Any]:
+    return {k: np.array(v) if isinstance(v, list) else v for k, v in columns.items()}
 
 
 def _plain(value: object) -> object:

@@ -39,6 +39,7 @@ class JudgementSettings(Settings):
     waiting: int = setting(
         48, "closures", "gated but not believed; the oldest is given up", minimum=2, maximum=200
     )
+    hints: int = setting(2000, "hints", "kept in doubt; older ones stay as they are", minimum=1)
     vote_windows: int = setting(
         4, "pairs", "of neighbouring sub-maps asked; each costs as much as a match", minimum=1
     )
@@ -72,6 +73,7 @@ class Judgement:
         self._settings = settings
         self._calibrations = calibrations or Calibrations(matching)
         self._waiting: deque[Closure] = deque(maxlen=settings.waiting)
+        self._hints: deque[int] = deque(maxlen=settings.hints)
 
     def consider(self, gated: list[Closure], atlas: Atlas, graph: PoseGraph) -> None:
         """Believe what can be believed of the new closures and of those that wait."""
@@ -98,13 +100,18 @@ class Judgement:
         self.counters["closures_given_up"] += max(0, len(waiting) - self._settings.waiting)
         self._waiting = deque(waiting, self._settings.waiting)
 
+    def note_hint(self, number: int | None) -> None:
+        """Remember a hint that the graph took, so that audits can doubt it."""
+        if number is not None:
+            self._hints.append(number)
+            self.counters["hints_taken"] += 1
+
     def audit(self, closures: list[Closure], graph: PoseGraph) -> None:
         """Take back active closures that the estimate contradicts; take in those it confirms."""
         for closure in closures:
             if closure.number is None or closure.stage is not Stage.CONSISTENT:
                 continue
-            innovation_m = graph.innovation(closure.number)
-            chi_square = innovation_m @ np.linalg.solve(closure.covariance_m2, innovation_m)
+            chi_square = graph.chi_square(closure.number)
             if closure.active and chi_square > self._settings.reject_chi_square:
                 closure.active = False
                 self.counters["closures_taken_back"] += 1
@@ -112,6 +119,9 @@ class Judgement:
                 closure.active = True
                 self.counters["closures_taken_in_again"] += 1
             graph.set_active(closure.number, active=closure.active)
+        for number in self._hints:
+            fits = graph.chi_square(number) < self._settings.accept_chi_square
+            graph.set_active(number, active=fits)
 
     def _believe(self, closure: Closure, graph: PoseGraph, reason: str) -> None:
         if closure.number is None:

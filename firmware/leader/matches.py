@@ -82,6 +82,9 @@ class MatchingSettings(Settings):
     covariance_scale: float = setting(
         1.0, "", "from simulated pairs, so that NEES is 2", minimum=0.1
     )
+    hint_gain: float = setting(
+        0.5, "", "share of the prior's variance that a hint must leave along some axis", minimum=0.0
+    )
     slope_smoothing_cells: float = setting(
         0.5, "cells", "keeps sounding noise out of the slopes", minimum=0.1
     )
@@ -125,11 +128,24 @@ class Match:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Hint:
+    """What a pair that gave no closure still says of the shift, as a Gaussian.
+
+    It is the factor that takes the prior to the first two moments of the posterior: wide where
+    several shifts compete, and narrower along an axis that they share.
+    """
+
+    shift_m: Array
+    covariance_m2: Array  # (2, 2), a kilometre along a direction without information
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MatchOutcome:
-    """A match, or the reason why there is none."""
+    """A match, or the reason why there is none and the hint that may be left."""
 
     match: Match | None
     reason: NoMatch | None
+    hint: Hint | None = None
 
 
 def count_reasons(outcomes: Iterable[MatchOutcome]) -> dict[NoMatch, int]:

@@ -9,16 +9,19 @@ from firmware.geometry import Array
 from firmware.leader import ambiguity
 from firmware.leader.alignment import Aligned, fields_of
 from firmware.leader.covariance import Refined, measure
-from firmware.leader.matches import Match, MatchingSettings, MatchOutcome, NoMatch
+from firmware.leader.matches import Hint, Match, MatchingSettings, MatchOutcome, NoMatch
 from firmware.leader.pair_problem import PairProblem, pair_problem, relief_of
 from firmware.leader.refinement import refine
 from firmware.leader.screening import ErrorSurface
 from firmware.submaps import GriddedSubmap
 from protocol.errors import EstimationError
 
+_WARPED_NOISE = 0.35  # of the cells' variance: taking drift out of a grid averages neighbours
+_NOTHING_GAINED = 0.95  # share of the prior's variance left: that axis is as unknown as before
+_NO_INFORMATION = 1e4  # variances of the prior
 _NEGLIGIBLE = 1e-6  # mass beside the best lattice shift's that is not worth refining
 
-__all__ = ["Match", "MatchOutcome", "MatchingSettings", "NoMatch", "match"]
+__all__ = ["Hint", "Match", "MatchOutcome", "MatchingSettings", "NoMatch", "match"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,7 +68,17 @@ def match(
     if problem is None:
         return _none(NoMatch.EMPTY)
     prior = _Prior(np.asarray(prior_shift_m), _checked(prior_covariance_m2))
-    return _search(problem, prior, times_s)
+    whole = problem.surface()
+    surface = _window(whole, prior, problem)
+    if surface is None or not np.isfinite(surface.residual_m2).any():
+        return _none(NoMatch.NO_OVERLAP)
+    relief = relief_of(problem, whole, _best(surface))
+    if relief is None:
+        return _none(NoMatch.FEATURELESS)
+    outcome = _search(problem, surface, relief, prior, times_s)
+    if outcome.match is None:
+        return replace(outcome, hint=_hint(problem, surface, relief, prior))
+    return outcome
 
 
 class _Prior(NamedTuple):
@@ -76,16 +89,13 @@ class _Prior(NamedTuple):
 
 
 def _search(
-    problem: PairProblem, prior: _Prior, times_s: tuple[float | None, float | None]
+    problem: PairProblem,
+    surface: ErrorSurface,
+    relief: ambiguity.Relief,
+    prior: _Prior,
+    times_s: tuple[float | None, float | None],
 ) -> MatchOutcome:
-    """Return the outcome: screen, evidence, refinement, gates."""
-    whole = problem.surface()
-    surface = _window(whole, prior, problem)
-    if surface is None or not np.isfinite(surface.residual_m2).any():
-        return _none(NoMatch.NO_OVERLAP)
-    relief = relief_of(problem, whole, _best(surface))
-    if relief is None:
-        return _none(NoMatch.FEATURELESS)
+    """Return the outcome of a screened pair: evidence, refinement, gates."""
     found = _posterior(surface, _evidence(surface, relief), prior, problem)
     candidates = _refine_best(surface, found, prior, problem, times_s)
     if not candidates:
@@ -101,6 +111,33 @@ def _search(
     best = int(np.argmax(scores))
     found = _posterior(surface, evidence, prior, problem)
     return _decide(candidates[best], refined[best], found, prior, problem)
+
+
+def _hint(
+    problem: PairProblem, surface: ErrorSurface, relief: ambiguity.Relief, prior: _Prior
+) -> Hint | None:
+    """Return the factor between the prior and the moments of the posterior, None if it is weak."""
+    misfit = surface.residual_m2 / surface.noise_m2
+    is_own = not (problem.reference.reconstructed or problem.query.reconstructed)
+    scale = max(1.2 * float(misfit.min()), _WARPED_NOISE if is_own else 0.5)
+    relief = replace(relief, noise_scale=scale, information_per_cell=problem.information(scale))
+    evidence = ambiguity.tempered_evidence(surface, relief, problem.correlated_cells)
+    found = _posterior(surface, evidence, prior, problem)
+    mean_m, covariance_m2 = ambiguity.moments(found, prior.mean_m, prior.covariance_m2)
+    root = np.linalg.cholesky(prior.covariance_m2)
+    inverse = np.linalg.inv(root)
+    left, axes = np.linalg.eigh(inverse @ covariance_m2 @ inverse.T)  # shares of the prior
+    if left[0] > problem.settings.hint_gain:
+        return None
+    gained = left < _NOTHING_GAINED
+    share = np.where(gained, left / np.maximum(1.0 - left, 1e-3), 1.0)
+    moved = axes.T @ inverse @ (mean_m - prior.mean_m)
+    away = np.where(gained, moved / np.maximum(1.0 - left, 1e-3), 0.0)
+    sigmas = np.where(gained, share, _NO_INFORMATION)
+    frame = root @ axes
+    return Hint(
+        shift_m=prior.mean_m + frame @ away, covariance_m2=frame @ np.diag(sigmas) @ frame.T
+    )
 
 
 def _tolerated(misfit: float) -> float:

@@ -26,6 +26,8 @@ from firmware.leader.screening import (
 from firmware.submaps import GriddedSubmap
 from protocol.errors import EstimationError
 
+_RESAMPLED_CELLS = 3.0
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairProblem:
@@ -55,6 +57,12 @@ class PairProblem:
             self.ridge_cells,
             absolute=absolute,
         )
+
+    @property
+    def correlated_cells(self) -> float:
+        """How many cells err together: neighbours by resampling, and what a decoder smooths."""
+        area = 2.0 * np.pi * (self.settings.correlation_m / self.query.grid.cell_m) ** 2
+        return float(_RESAMPLED_CELLS * (1.0 + 0.5 * self.noise.correlated_share * area))
 
     def information(self, noise_scale: float) -> float:
         """Return the information per cell of the layer that has less of it."""

@@ -306,12 +306,23 @@ class PoseGraph:
 
     def innovation(self, number: int) -> Array:
         """Return estimated minus measured offset (2,) of a closure, in metres."""
-        record = self._ledger[number].record
-        if not isinstance(record, ClosureRecord):
-            raise EstimationError(f"record {number} is not a closure")
+        record = self._closure(number)
         return record.innovation_m(
             self._state(record.origin.key)[:2], self._state(record.target.key)[:2]
         )
+
+    def chi_square(self, number: int) -> float:
+        """Return the squared innovation of a closure in units of its covariance."""
+        innovation_m = self.innovation(number)
+        return float(
+            innovation_m @ np.linalg.solve(self._closure(number).covariance_m2, innovation_m)
+        )
+
+    def _closure(self, number: int) -> ClosureRecord:
+        record = self._ledger[number].record
+        if not isinstance(record, ClosureRecord):
+            raise EstimationError(f"record {number} is not a closure")
+        return record
 
     def _append(self, chain: Chain, time_s: float, reckoned_m: Array, state: Array) -> int:
         key: int = gtsam.symbol("x", (chain.number << 24) | len(chain.keys))

@@ -8,7 +8,7 @@ from firmware.follower.journaled import JournaledFollower
 from firmware.inputs import fan_of, from_ping, to_ping
 from firmware.journal import Journal, JournalSettings, Owner
 from firmware.leader.journaled import JournaledLeader, from_outcomes, to_outcomes
-from firmware.leader.matches import Match, MatchOutcome, NoMatch
+from firmware.leader.matches import Hint, Match, MatchOutcome, NoMatch
 from firmware.soundings import Ping
 from host_tools.kills import Fate, MortalJournal, MortalNode, SensorTape
 from host_tools.mission import deployed, run, simulated_vehicles, water_between
@@ -170,6 +170,8 @@ def test_outcomes_read_back_exactly() -> None:
     )
     outcomes = [MatchOutcome(match=found, reason=None)]
     outcomes += [MatchOutcome(match=None, reason=reason) for reason in NoMatch]
+    hint = Hint(shift_m=np.array([0.1, -3.0]), covariance_m2=np.eye(2) / 3)
+    outcomes.append(MatchOutcome(match=None, reason=NoMatch.AMBIGUOUS, hint=hint))
     read, now_s = to_outcomes(from_outcomes(outcomes, 0.1 + 0.2))
     assert now_s == 0.1 + 0.2
     assert [o.reason for o in read] == [o.reason for o in outcomes]
@@ -177,6 +179,9 @@ def test_outcomes_read_back_exactly() -> None:
     assert read[0].match.log_evidence == np.inf
     np.testing.assert_array_equal(read[0].match.covariance_m2, found.covariance_m2)
     np.testing.assert_array_equal(read[0].match.shift_m, found.shift_m)
+    assert read[-1].hint is not None
+    np.testing.assert_array_equal(read[-1].hint.covariance_m2, hint.covariance_m2)
+    np.testing.assert_array_equal(read[-1].hint.shift_m, hint.shift_m)
 
 
 def test_checkpoint_that_cannot_be_read_starts_the_vehicle_anew(tmp_path: Path) -> None:

@@ -1,0 +1,51 @@
+import numpy as np
+
+from firmware.geometry import Array
+from firmware.leader.matching import Hint, MatchingSettings, match
+from tests.matching.scenes import Scene
+
+STILL = MatchingSettings(walk_m2_per_s=0.0, drift_sigma_mps=0.0, position_sigma_m=0.1)
+PRIOR_M2 = 400.0 * np.eye(2)
+
+
+def hint_of(scene: Scene, truth_m: Array) -> Hint | None:
+    reference = scene.submap(200, 100, (31, 60))
+    query = scene.submap(210, 160, (31, 60), shift_m=(truth_m[0], truth_m[1]))
+    return match(reference, query, np.zeros(2), PRIOR_M2, STILL).hint
+
+
+def posterior(hint: Hint) -> tuple[Array, Array]:
+    """Return mean and covariance of the shift once the hint has met the prior."""
+    information = np.linalg.inv(hint.covariance_m2)
+    covariance_m2 = np.linalg.inv(np.linalg.inv(PRIOR_M2) + information)
+    return covariance_m2 @ information @ hint.shift_m, covariance_m2
+
+
+def test_faint_relief_leaves_hints_as_sure_as_they_say() -> None:
+    squares, gains = [], []
+    for seed in range(70):
+        scene = Scene(seed, rms_m=0.035)
+        truth_m = scene.rng.normal(0.0, 20.0, 2)
+        hint = hint_of(scene, truth_m)
+        if hint is None:
+            continue
+        mean_m, covariance_m2 = posterior(hint)
+        away_m = truth_m - mean_m
+        squares.append(float(away_m @ np.linalg.solve(covariance_m2, away_m)))
+        gains.append(0.5 * np.log(np.linalg.det(PRIOR_M2) / np.linalg.det(covariance_m2)))
+    assert len(squares) >= 6
+    assert np.mean(squares) < 2.6  # two degrees of freedom; tempered evidence stays below
+    assert np.mean(gains) > 0.7  # nats: half of the prior's area each, or less
+
+
+def test_seabed_without_relief_leaves_no_hint() -> None:
+    for seed in range(10):
+        assert hint_of(Scene(seed, rms_m=1e-4), np.zeros(2)) is None
+
+
+def test_closure_leaves_no_hint_beside_it(scene: Scene) -> None:
+    reference = scene.submap(200, 200, (41, 70))
+    query = scene.submap(180, 230, (70, 41))
+    outcome = match(reference, query, np.zeros(2), PRIOR_M2, STILL)
+    assert outcome.match is not None
+    assert outcome.hint is None

@@ -62,12 +62,14 @@ def fields_of(layer: Layer, smoothing_cells: float) -> Array:
     """Return depth, variance, time and smoothed slopes to north and east, (5, R, C).
 
     Slopes are smoothed over the known cells to keep sounding noise out; all fields are NaN where
-    one of them is unknown.
+    one of them is unknown. A grid of one row or column has no slopes: nothing of it is known.
     """
     depth = np.where(layer.known > 0, layer.grid.depth_m - np.nanmean(layer.grid.depth_m), 0.0)
     share = ndimage.gaussian_filter(layer.known, smoothing_cells, mode="constant")
     smooth = ndimage.gaussian_filter(depth, smoothing_cells, mode="constant")
     smooth = np.where(share > 0.3, smooth / np.maximum(share, 0.3), np.nan)
+    if min(smooth.shape) < 2:
+        return np.full((5, *smooth.shape), np.nan)
     slopes = np.gradient(smooth, layer.grid.cell_m)
     stack = np.stack([layer.grid.depth_m, layer.map_m2, layer.grid.time_s, *slopes])
     return np.where(np.isfinite(stack).all(axis=0), stack, np.nan)

@@ -37,6 +37,13 @@ class WaterSettings(Settings):
     bad_state_loss: float = setting(
         1.0, "share", "loss during a bad spell of Gilbert-Elliott", minimum=0.01, maximum=1.0
     )
+    packet_frames: int = setting(
+        1,
+        "frames",
+        "of one packet, heard or lost together: two at a Micro-Modem's rates 3 and 4",
+        minimum=1,
+        maximum=8,
+    )
     corruption: float = setting(
         0.0, "share", "modems check their frames; raw lines do not", minimum=0.0, maximum=1.0
     )
@@ -112,6 +119,8 @@ class _Interval:
 
 
 PURPOSES = ("loss", "spell", "corruption", "damage", "duplication", "noise", "outlier")
+PACKED_BYTES = 128
+"""Smaller frames go alone: answers are flexible packets."""
 KEEP_S = 120.0
 """How long past sounds are remembered for collisions; longer than any frame and travel time."""
 
@@ -132,6 +141,7 @@ class Water:
         self._seed = int(rng.integers(1 << 62))
         self._generators: dict[tuple[str, int, int], np.random.Generator] = {}
         self._is_bad: dict[tuple[int, int], bool] = {}
+        self._packets: dict[tuple[int, int], tuple[int, bool]] = {}
         self._own: dict[int, list[_Interval]] = {node: [] for node in self.nodes}
         self._heard: dict[int, list[_Interval]] = {node: [] for node in self.nodes}
         self._queue: list[tuple[float, int, _Arrival]] = []
@@ -200,7 +210,7 @@ class Water:
         noise_m = settings.range_noise_m * self._draw("noise", link).standard_normal()
         factor = settings.outlier_factor if is_outlier else 1.0
         measured_s = now_s + factor * travel_s + noise_m / settings.sound_speed_mps
-        is_lost = self._is_lost(link)
+        is_lost = self._packet_is_lost(link, len(frame), self._is_lost(link))
         is_corrupt = self._draw("corruption", link).random() < settings.corruption
         damaged = self._damage(link, frame)
         has_echo = self._draw("duplication", link).random() < settings.duplication
@@ -261,6 +271,15 @@ class Water:
             leaves = self._to_good if self._is_bad[link] else self._to_bad
             self._is_bad[link] ^= bool(turn < leaves)
         return self._is_bad[link] and bool(chance < settings.bad_state_loss)
+
+    def _packet_is_lost(self, link: tuple[int, int], size_bytes: int, drawn: bool) -> bool:
+        """Return whether a frame is lost: by its own draw, or that of its packet's first frame."""
+        if self.settings.packet_frames == 1 or size_bytes < PACKED_BYTES:
+            return drawn
+        place, fate = self._packets.get(link, (0, drawn))
+        fate = drawn if place == 0 else fate
+        self._packets[link] = ((place + 1) % self.settings.packet_frames, fate)
+        return fate
 
     def _damage(self, link: tuple[int, int], frame: bytes) -> bytes:
         """Return the frame with some bits turned; drawn for every frame, used for few."""

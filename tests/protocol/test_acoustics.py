@@ -93,6 +93,18 @@ def test_loss_has_its_share() -> None:
     assert fates.count("lost") / 5000 == pytest.approx(0.14, abs=0.02)
 
 
+def test_frames_of_one_packet_are_lost_together_and_answers_alone() -> None:
+    medium = water(WaterSettings(loss=0.3, packet_frames=2), at(0.0, 300.0))
+    fates = [delivery.fate for delivery in run(medium, 2000)]
+    assert fates[::2] == fates[1::2]
+    assert fates.count("lost") == pytest.approx(600, abs=70)
+    alone = water(WaterSettings(loss=0.3, packet_frames=2), at(0.0, 300.0))
+    for i in range(2000):
+        alone.transmit(0, 10.0 * i, FRAME[:22])
+    singles = [delivery.fate for delivery in alone.deliveries_until(np.inf)]
+    assert singles[::2] != singles[1::2]
+
+
 def test_bursts_have_the_share_and_the_mean_length() -> None:
     settings = WaterSettings(loss=0.14, loss_model="gilbert-elliott", burst_frames=5.0)
     lost = [d.fate == "lost" for d in run(water(settings, at(0.0, 500.0)), 20_000)]

@@ -1,6 +1,7 @@
 """What both loops do with their ports: read the modem, read the sensors, write the modem."""
 
 import logging
+import math
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from typing import Protocol
@@ -50,8 +51,8 @@ class SensorPort:
 class ModemPort:
     """Moves frames between a modem and a core, and counts what the link did meanwhile."""
 
-    def __init__(self, modem: Modem) -> None:
-        self._modem = modem
+    def __init__(self, modem: Modem, period_s: float = 0.25) -> None:
+        self._modem, self._period_s = modem, period_s
         self.counters: Counter[str] = Counter()
         self.notices: deque[str] = deque(maxlen=20)  # for the status; older ones are in the log
 
@@ -67,26 +68,41 @@ class ModemPort:
                 LOG.warning("%.2f s: %s", event.at_s, event.text)
 
     def speak(self, poll: Callable[[float], bytes | None], now_s: float) -> None:
-        """Send the core's frame of this instant.
+        """Send the core's frames of this instant, or of the second that a lead before it is now.
+
+        A modem that loads its packets before they start is given them by the last period that is
+        early enough: what the core then knows is newest.
 
         While the port is away the core is not asked: a frame that waits in a queue would leave
         with a time of transmission that is no longer true, and its range would be wrong.
         """
-        if self._modem.status().is_up:
-            frame = poll(now_s)
-            if frame is not None:
-                self._modem.send(frame, now_s)
+        start_s = self._start_s(now_s)
+        if start_s is not None and self._modem.status().is_up:
+            for _ in range(self._modem.frames_per_packet):
+                frame = poll(start_s)
+                if frame is None:
+                    break
+                self._modem.send(frame, now_s, start_s)
         self._modem.poll(now_s)
+
+    def _start_s(self, now_s: float) -> float | None:
+        """Return when a frame that is handed over now would start; None: a later one does too."""
+        earliest_s = now_s + self._modem.lead_s
+        if self._modem.lead_s == 0.0:
+            return now_s
+        start_s = float(math.ceil(earliest_s - _SAME_INSTANT_S))
+        return start_s if start_s - earliest_s < self._period_s - _SAME_INSTANT_S else None
 
     def status(self) -> dict[str, int]:
         """Return the link's counters."""
         status = self._modem.status()
         return {
             **self.counters,
+            **{f"modem_{name}": count for name, count in status.errors.items()},
             "modem_sent": status.sent,
             "modem_received": status.received,
             "modem_queued": status.queued,
             "modem_dropped": status.dropped_in + status.dropped_out,
             "modem_discarded": status.discarded,
             "modem_reopened": status.reopened,
-        } | {f"modem_{name}": count for name, count in status.errors.items()}
+        }

@@ -43,9 +43,11 @@ class Recorder:
     def unfinished_from_s(self, tick_s: float) -> float:
         """Return the first instant that the journal does not hold to its end: its poll.
 
-        A modem that was away was not polled; then only the last instant is in question.
+        A modem that was away was not polled; then only the last instant is in question. One with a
+        lead was polled for a later instant than that.
         """
-        return max(self._polled[0] + tick_s, self.last_tick_s)
+        was_polled = self._polled[0] >= self.last_tick_s
+        return self.last_tick_s + tick_s if was_polled else self.last_tick_s
 
     def odometry(self, odometry: Odometry) -> Odometry | None:
         """Record navigation; None for what the journal already holds."""

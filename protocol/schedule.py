@@ -16,6 +16,9 @@ class SlotSettings(Settings):
 
     followers: int = setting(1, "vehicles", "the paper's system", minimum=1, maximum=14)
     follower_slot_s: int = setting(4, "s", "0.25 Hz, section 4.1 of the paper", minimum=1)
+    frames_per_slot: int = setting(
+        1, "frames", "two where a Micro-Modem packs them at rate 3 or 4", minimum=1, maximum=8
+    )
     leader_period_s: int = setting(20, "s", "two answers in it are 0.1 Hz", minimum=1)
     leader_offsets_s: tuple[int, ...] = setting(
         (3, 11), "s", "3 s after a follower's slot begins, its frame has passed within 1.4 km"
@@ -62,8 +65,10 @@ class Slots:
         return self.next_follower_slot_s(now_s, vehicle)
 
     def frames_per_submap(self, submap_s: float) -> int:
-        """Return how many slots one follower has while a sub-map is measured."""
-        return int(submap_s // (self.settings.follower_slot_s * self.settings.followers))
+        """Return how many frames one follower may send while a sub-map is measured."""
+        settings = self.settings
+        slots = int(submap_s // (settings.follower_slot_s * settings.followers))
+        return slots * settings.frames_per_slot
 
 
 def _next_in_raster(now_s: float, period_s: float, offset_s: float) -> float:

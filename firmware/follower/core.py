@@ -77,6 +77,7 @@ class FollowerCore:
             vehicle, boot_epoch, settings.repeats, small_frames=self._compression.small_frames
         )
         self._next_slot_s = slots.next_slot_s(vehicle, start.time_s)
+        self._frames_left = slots.settings.frames_per_slot
         self._last_submap_s = start.time_s
 
     def receive_odometry(self, odometry: Odometry) -> None:
@@ -124,16 +125,20 @@ class FollowerCore:
             self._fit.best = step
 
     def poll(self, now_s: float) -> bytes | None:
-        """Return the frame to transmit now, or None; one a slot, on a whole second."""
+        """Return a frame to transmit now, or None; as many a slot as it holds, one each call."""
         if self._next_slot_s - _SUPERFRAME_S < now_s < self._next_slot_s - 1e-6:
             return None
         slot_s = self._slots.next_slot_s(self.vehicle, now_s)
         on_time = abs(slot_s - now_s) < 1e-6
-        self._next_slot_s = self._slots.next_slot_s(self.vehicle, now_s + 1e-3)
-        if not on_time:
+        packet = None
+        if on_time:
+            self._frames_left -= 1
+            packet = self._outbox.next_packet(slot_s, self._slots_left(slot_s), self._idle_states())
+        else:
             self.counters["slots_missed"] += 1
-            return None
-        packet = self._outbox.next_packet(slot_s, self._slots_left(slot_s), self._idle_states())
+        if packet is None or self._frames_left <= 0:
+            self._next_slot_s = self._slots.next_slot_s(self.vehicle, now_s + 1e-3)
+            self._frames_left = self._slots.settings.frames_per_slot
         if packet is None:
             return None
         self.counters["frames_sent"] += 1

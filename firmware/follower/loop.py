@@ -23,7 +23,7 @@ class FollowerLoop:
         period_s: float = 0.25,
     ) -> None:
         self.core = core
-        self._sensors, self._link = SensorPort(steps), ModemPort(modem)
+        self._sensors, self._link = SensorPort(steps), ModemPort(modem, period_s)
         self._executive = Executive(
             (
                 # Deadlines: hear, sense and fit leave the last fifth of a period to a frame.

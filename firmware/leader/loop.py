@@ -26,7 +26,7 @@ class LeaderLoop:
     ) -> None:
         self.core = core
         self._worker = worker
-        self._sensors, self._link = SensorPort(steps), ModemPort(modem)
+        self._sensors, self._link = SensorPort(steps), ModemPort(modem, period_s)
         self._executive = Executive(
             (
                 Task(name="hear", period_s=period_s, deadline_s=0.2 * period_s, work=self._hear),

@@ -24,6 +24,7 @@ class FaultyModem:
     """
 
     lead_s = 0.0
+    frames_per_packet = 1
 
     def __init__(
         self,

@@ -32,6 +32,7 @@ class SilentModem:
 
     largest_frame_bytes = 256
     lead_s = 0.0
+    frames_per_packet = 1
 
     def send(self, frame: bytes, now_s: float, start_s: float | None = None) -> None:
         """Let the frame be."""

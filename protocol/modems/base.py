@@ -90,6 +90,10 @@ class Modem(Protocol):
     def lead_s(self) -> float:
         """How long before its second of transmission a frame must be handed over; 0: then."""
 
+    @property
+    def frames_per_packet(self) -> int:
+        """How many frames that are handed over together start together."""
+
     def send(self, frame: bytes, now_s: float, start_s: float | None = None) -> None:
         """Queue a frame for the second start_s; without one it starts as soon as can be."""
 

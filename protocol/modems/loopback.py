@@ -51,6 +51,7 @@ class LoopbackModem:
     """One node's modem: starts a frame when asked, or when its last one has ended."""
 
     lead_s = 0.0
+    frames_per_packet = 1
 
     def __init__(self, medium: LoopbackMedium, node: int) -> None:
         self._medium = medium

@@ -74,6 +74,11 @@ class SealedModem:
         """How long before its second a frame must be handed over."""
         return self._modem.lead_s
 
+    @property
+    def frames_per_packet(self) -> int:
+        """How many frames start together."""
+        return self._modem.frames_per_packet
+
     def send(self, frame: bytes, now_s: float, start_s: float | None = None) -> None:
         """Seal and queue a frame; one that cannot be sealed stays here, counted."""
         if self.lead_s > 0.0:

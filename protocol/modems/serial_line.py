@@ -35,6 +35,7 @@ class SerialLineModem:
     """
 
     lead_s = 0.0
+    frames_per_packet = 1
 
     def __init__(self, path: str, baud: int, tap: Tap | None = None) -> None:
         self._path, self._baud, self._tap = path, baud, tap

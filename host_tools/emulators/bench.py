@@ -7,7 +7,7 @@ was hit and how hard.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -79,8 +79,14 @@ class Unit(Protocol):
 class Bench:
     """Runs the units of a water in the order of their events, up to the time that is asked for."""
 
-    def __init__(self, water: Water, units: Mapping[int, Unit]) -> None:
+    def __init__(
+        self,
+        water: Water,
+        units: Mapping[int, Unit],
+        record: Callable[[Delivery], None] | None = None,
+    ) -> None:
         self.water, self.units = water, dict(units)
+        self._record = record
         self.now_s = 0.0
         self.fates: dict[str, int] = {}
         self._airborne: dict[tuple[int, float], AirPacket] = {}
@@ -135,6 +141,8 @@ class Bench:
 
     def _deliver(self, delivery: Delivery) -> None:
         self.fates[delivery.fate] = self.fates.get(delivery.fate, 0) + 1
+        if self._record is not None:
+            self._record(delivery)
         packet = self._airborne.get((delivery.source, delivery.t_tx_s))
         unit = self.units.get(delivery.destination)
         if packet is None or unit is None or delivery.fate in {"out-of-reach", "half-duplex"}:

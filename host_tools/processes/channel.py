@@ -14,6 +14,7 @@ from host_tools.commands import Command
 from host_tools.evaluation import evaluate
 from host_tools.mapping import DepthMap
 from host_tools.mission import Progress, run, simulated_vehicles, water_between
+from host_tools.processes.emulated_modems import MODEMS, EmulatedModems
 from host_tools.processes.fleet import Fleet, OnWait
 from host_tools.processes.pace import Pace
 from host_tools.processes.records import FOLDER, VehicleFiles
@@ -38,10 +39,12 @@ def host_mission(
     progress: Progress,
     ports: Path | None = None,
     pace: Pace | None = None,
+    modems: str = "raw",
 ) -> MissionResult:
     """Return a mission whose vehicles are processes, from the files that they leave in out.
 
-    ready is called when the ports are there; on_wait while processes are missing.
+    ready is called when the ports are there; on_wait while processes are missing. modems says what
+    is at the ports: raw lines that carry frames, or emulated modems of a dialect.
     """
     vehicles = simulated_vehicles(voyage.settings, voyage.site, voyage.seed)
     water = water_between(voyage.settings, vehicles, voyage.seed)
@@ -49,25 +52,32 @@ def host_mission(
     for each in files.values():
         each.forget()
     deliveries: list[Delivery] = []
+    emulated = None if modems == "raw" else EmulatedModems(modems, water, deliveries.append)
+    paced = progress if pace is None else pace.after(progress)
+    duration_s, tick_s = voyage.settings.scenario.duration_s, voyage.tick_s
     with Fleet(
         water,
         voyage.fingerprint,
         on_wait=on_wait,
         folder=ports,
         pace=pace,
+        modems=emulated,
     ) as fleet:
         ready(fleet)
         fleet.wait_for_all()
         if pace is not None:
             pace.start()
-        run(
-            fleet.nodes,
-            water,
-            duration_s=voyage.settings.scenario.duration_s,
-            tick_s=voyage.tick_s,
-            record=deliveries.append,
-            progress=progress if pace is None else pace.after(progress),
-        )
+        if emulated is not None:
+            emulated.run(fleet.nodes, duration_s=duration_s, tick_s=tick_s, progress=paced)
+        else:
+            run(
+                fleet.nodes,
+                water,
+                duration_s=duration_s,
+                tick_s=tick_s,
+                record=deliveries.append,
+                progress=paced,
+            )
         fleet.end()
         lines = {f"line_{node.name}": node.status() for node in fleet.nodes.values()}
     return _result(voyage, vehicles, files, deliveries, lines)
@@ -145,8 +155,19 @@ class WaitNotice:
         self._said = names
 
 
+def add_modem_argument(parser: argparse.ArgumentParser) -> None:
+    """Add what is at the ports."""
+    parser.add_argument(
+        "--modems",
+        choices=MODEMS,
+        default="raw",
+        help="raw lines that carry frames (default), or emulated modems",
+    )
+
+
 def _configure(parser: argparse.ArgumentParser) -> None:
     add_voyage_arguments(parser)
+    add_modem_argument(parser)
     parser.add_argument(
         "--real-time", action="store_true", help="follow the wall clock; default: virtual time"
     )
@@ -178,6 +199,7 @@ def _run(arguments: argparse.Namespace) -> None:
             progress=lambda now_s: advance(bar, now_s),
             ports=arguments.ports,
             pace=Pace(voyage.tick_s) if arguments.real_time else None,
+            modems=arguments.modems,
         )
     print("\n".join(finish(result, out, report=not arguments.no_report)))
     print(f"outputs in {out}")

@@ -50,11 +50,15 @@ class Advance:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Done:
-    """The period is over: CRCs of the frames written to the line, and of arrivals not found."""
+    """The period is over: CRCs of the frames written to the line, and of arrivals not found.
+
+    On the line of a modem that has a dialect it is the bytes written since the start that count.
+    """
 
     now_s: float
     frames: tuple[int, ...] = ()
     missed: tuple[int, ...] = ()
+    line_bytes: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from host_tools.commands import Command
 from host_tools.processes.channel import (
+    add_modem_argument,
     advance,
     finish,
     host_mission,
@@ -102,7 +103,12 @@ def crew() -> Iterator[Crew]:
 
 
 def run_demo(
-    voyage: Voyage, out: Path, progress: Callable[[float], None], *, report: bool = True
+    voyage: Voyage,
+    out: Path,
+    progress: Callable[[float], None],
+    *,
+    report: bool = True,
+    modems: str = "raw",
 ) -> list[str]:
     """Run a mission with every vehicle in its own process; return the table of errors."""
     with crew() as processes:
@@ -113,7 +119,9 @@ def run_demo(
                 arguments = vehicle_command(fleet, node, voyage, out)
                 processes.start(node.name, arguments, out / FOLDER / f"{node.name}.log")
 
-        result = host_mission(voyage, out, ready=ready, on_wait=processes.check, progress=progress)
+        result = host_mission(
+            voyage, out, ready=ready, on_wait=processes.check, progress=progress, modems=modems
+        )
     return finish(result, out, report=report)
 
 
@@ -124,6 +132,7 @@ def _last_line(child: _Child) -> str:
 
 def _configure(parser: argparse.ArgumentParser) -> None:
     add_voyage_arguments(parser)
+    add_modem_argument(parser)
     parser.set_defaults(changes=list(SHORTENED))  # what --set gives comes later, and counts
     parser.add_argument(
         "--out", type=Path, default=Path("out/demo"), metavar="DIR", help="default: out/demo"
@@ -143,7 +152,7 @@ def _run(arguments: argparse.Namespace) -> None:
         flush=True,
     )
     with tqdm(total=total_s, unit="s", desc="mission", leave=False, disable=None) as bar:
-        lines = run_demo(voyage, out, lambda now_s: advance(bar, now_s))
+        lines = run_demo(voyage, out, lambda now_s: advance(bar, now_s), modems=arguments.modems)
     print("\n".join(lines))
     took_s = time.monotonic() - began_s
     print(f"{took_s:.0f} s in all; {out / 'report.html'}")

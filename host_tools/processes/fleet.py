@@ -11,6 +11,7 @@ from types import TracebackType
 
 from host_tools.emulators.ptys import PseudoPort
 from host_tools.processes.control import ControlLine, Done, End, Hello, Refused
+from host_tools.processes.emulated_modems import EmulatedModems, ModemNode, address_of
 from host_tools.processes.pace import Pace
 from host_tools.processes.remote_node import RemoteNode
 from host_tools.processes.served_clock import CLOCK_SCHEME
@@ -41,6 +42,7 @@ class Fleet:
         on_wait: OnWait,
         folder: Path | None = None,
         pace: Pace | None = None,
+        modems: "EmulatedModems | None" = None,
     ) -> None:
         self.water, self.on_wait = water, on_wait
         self._mission, self._pace = mission, pace
@@ -51,16 +53,8 @@ class Fleet:
         self._ended: set[int] = set()
         self._is_ending = False
         self._socket = self._listen()
-        self.nodes = {
-            vehicle: RemoteNode(
-                vehicle,
-                PseudoPort(DEFAULT_BAUD, self.folder / _port_name(vehicle)),
-                self.advance,
-                self.until_answered,
-                lambda v=vehicle: self._now_s >= water.transmitting_until_s(v),  # type: ignore[misc]
-            )
-            for vehicle in water.nodes
-        }
+        self._modems = modems
+        self.nodes = {vehicle: self._node(vehicle) for vehicle in water.nodes}
         for node in self.nodes.values():
             node.in_real_time = pace is not None
 
@@ -82,7 +76,9 @@ class Fleet:
 
     def modem_url(self, vehicle: int) -> str:
         """Return what a vehicle is given as --modem."""
-        return f"serial://{self.nodes[vehicle].port.name}"
+        scheme = "serial" if self._modems is None else self._modems.scheme
+        options = "" if self._modems is None else f"?address={address_of(vehicle)}"
+        return f"{scheme}://{self.nodes[vehicle].port.name}{options}"
 
     def missing(self) -> list[RemoteNode]:
         """Return the nodes whose processes are not there, and should be."""
@@ -134,6 +130,16 @@ class Fleet:
     @property
     def _socket_path(self) -> Path:
         return self.folder / "clock"
+
+    def _node(self, vehicle: int) -> RemoteNode:
+        baud = DEFAULT_BAUD if self._modems is None else self._modems.baud
+        port = PseudoPort(baud, self.folder / _port_name(vehicle))
+        drives = (self.advance, self.until_answered)
+        if self._modems is not None:
+            return ModemNode(vehicle, port, *drives, self._modems.bench.units[vehicle])
+        return RemoteNode(
+            vehicle, port, *drives, lambda: self._now_s >= self.water.transmitting_until_s(vehicle)
+        )
 
     def _listen(self) -> socket.socket:
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)

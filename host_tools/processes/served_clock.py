@@ -5,6 +5,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Protocol
 
 from host_tools.processes.control import Advance, Arrival, ControlLine, Done, End, Hello, Refused
 from protocol.crc import crc32c
@@ -17,8 +18,46 @@ NAP_S = 0.0002
 CLOCK_SCHEME = "unix://"
 
 
+class ChannelLine(Protocol):
+    """What the clock has to know of a vehicle's line: what came over it, and what went."""
+
+    @property
+    def line_bytes(self) -> int:
+        """The bytes written since the start, where they are counted; 0 where frames are."""
+
+    def collect(self, arrivals: tuple[Arrival, ...], now_s: float) -> tuple[int, ...]:
+        """Take the announced frames from the line; return the CRCs of those that did not come."""
+
+    def frames_written(self) -> tuple[int, ...]:
+        """Return the CRCs of the frames written since the last call."""
+
+
+class CountedLine:
+    """A dialect's line: the channel waits for its bytes, in both directions, before time goes on.
+
+    `tap` is to be the driver's.
+    """
+
+    def __init__(self) -> None:
+        self.line_bytes = 0
+
+    def tap(self, direction: str, data: bytes, now_s: float) -> None:  # noqa: ARG002
+        """Count what goes out."""
+        self.line_bytes += len(data) if direction == "out" else 0
+
+    def collect(self, arrivals: tuple[Arrival, ...], now_s: float) -> tuple[int, ...]:  # noqa: ARG002
+        """Take nothing: the channel has seen the bytes at the port, the driver will read them."""
+        return ()
+
+    def frames_written(self) -> tuple[int, ...]:
+        """Name no frames: the dialect has them in its sentences."""
+        return ()
+
+
 class StampedModem:
     """A raw line beside the channel's word on when each frame's first bit arrived."""
+
+    line_bytes = 0
 
     def __init__(self, line: Modem) -> None:
         self._line = line
@@ -37,6 +76,11 @@ class StampedModem:
     def lead_s(self) -> float:
         """A line has none."""
         return self._line.lead_s
+
+    @property
+    def frames_per_packet(self) -> int:
+        """A line carries one after the other."""
+        return self._line.frames_per_packet
 
     def send(self, frame: bytes, now_s: float, start_s: float | None = None) -> None:
         """Write a frame to the line."""
@@ -114,7 +158,7 @@ class ServedClock:
         When the channel refuses this vehicle.
     """
 
-    def __init__(self, url: str, vehicle: int, mission: str, modem: StampedModem) -> None:
+    def __init__(self, url: str, vehicle: int, mission: str, modem: "ChannelLine") -> None:
         self._url, self._modem = url, modem
         self._now_s = 0.0
         self.in_real_time = False
@@ -140,8 +184,9 @@ class ServedClock:
                     self._now_s, self.in_real_time = message.now_s, message.in_real_time
                     missed = self._modem.collect(message.arrivals, self._now_s)
                     yield self._now_s
-                    frames = self._modem.frames_written()
-                    self._line.send(Done(now_s=self._now_s, frames=frames, missed=missed))
+                    frames, count = self._modem.frames_written(), self._modem.line_bytes
+                    done = Done(now_s=self._now_s, frames=frames, missed=missed, line_bytes=count)
+                    self._line.send(done)
 
     def end(self) -> None:
         """Tell the channel that this vehicle's files are written."""

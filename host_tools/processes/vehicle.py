@@ -36,7 +36,7 @@ from host_tools.processes.resume import (
     steps_since,
 )
 from host_tools.processes.sealing import seal_of, sealed_voyage
-from host_tools.processes.served_clock import ServedClock, StampedModem
+from host_tools.processes.served_clock import CountedLine, ServedClock, StampedModem
 from host_tools.processes.voyage import Voyage, add_voyage_arguments, voyage_of
 from host_tools.simulator.vehicle import SimulatedVehicle
 from protocol.errors import ConfigError
@@ -202,9 +202,13 @@ def _modem_and_clock(
         began = datetime.datetime.fromtimestamp(start_utc_s, datetime.UTC)
         print(f"the mission starts at {began:%Y-%m-%d %H:%M:%S} UTC", file=sys.stderr)
         return modem, WallClock(start_utc_s, voyage.settings.scenario.duration_s)
-    stamped = StampedModem(open_modem(modem_url, context))
-    clock = ServedClock(clock_url, vehicle, voyage.fingerprint, stamped)
-    return _sealed(stamped, seal), clock
+    if modem_url.startswith("serial:"):
+        stamped = StampedModem(open_modem(modem_url, context))
+        clock = ServedClock(clock_url, vehicle, voyage.fingerprint, stamped)
+        return _sealed(stamped, seal), clock
+    line = CountedLine()
+    modem = open_modem(modem_url, dataclasses.replace(context, tap=line.tap))
+    return _sealed(modem, seal), ServedClock(clock_url, vehicle, voyage.fingerprint, line)
 
 
 def _sealed(modem: Modem, seal: SealedLink | None) -> Modem:

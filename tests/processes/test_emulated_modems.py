@@ -1,0 +1,97 @@
+"""Vehicles on modems that load a packet before it starts: the core is asked a lead before."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware.dead_reckoning import ReckonedState
+from firmware.follower.core import FollowerCore
+from firmware.follower.settings import FollowerSettings
+from firmware.ports import ModemPort
+from firmware.soundings import Odometry
+from host_tools.cli import main
+from protocol.acoustics import Water, WaterSettings
+from protocol.codec import decode
+from protocol.modems.loopback import LoopbackMedium
+from protocol.schedule import Slots, SlotSettings
+
+START = ReckonedState(time_s=0.0, north_m=0.0, east_m=0.0, yaw_rad=0.0, depth_m=0.0)
+PAIRS = ("follower_slot_s=8", "leader_period_s=40", "leader_offsets_s=5,13,21,29")
+
+
+class Loading:
+    """A loopback modem that says it must be given frames in pairs, 1.7 s before."""
+
+    def __init__(self) -> None:
+        still = Water(WaterSettings(), np.random.default_rng(1), lambda *_: (0.0, 0.0, 0.0))
+        self.inner = LoopbackMedium(still).modem(1)
+        self.inner.lead_s, self.inner.frames_per_packet = 1.7, 2
+        self.sent: list[tuple[float, float | None]] = []
+        self.inner.send = self.send  # type: ignore[method-assign]
+
+    def send(self, frame: bytes, now_s: float, start_s: float | None = None) -> None:
+        assert frame == b"frame"
+        self.sent.append((now_s, start_s))
+
+
+def test_a_core_is_asked_for_a_pair_by_the_last_period_that_is_early_enough() -> None:
+    modem, asked = Loading(), list[float]()
+
+    def poll(start_s: float) -> bytes | None:
+        asked.append(start_s)
+        return b"frame" if start_s % 8.0 == 0.0 else None
+
+    port = ModemPort(modem.inner, period_s=0.25)
+    for k in range(4 * 17):
+        port.speak(poll, k * 0.25)
+    assert modem.sent == [(6.25, 8.0), (6.25, 8.0), (14.25, 16.0), (14.25, 16.0)]
+    assert [second for second in asked if second % 8.0] == [
+        float(second) for second in range(2, 19) if second % 8
+    ]
+
+
+def test_a_follower_has_as_many_frames_for_a_slot_as_it_holds() -> None:
+    slots = Slots(SlotSettings(follower_slot_s=8, frames_per_slot=2))
+    assert slots.frames_per_submap(40.0) == 10
+    core = FollowerCore(1, 0, START, settings=FollowerSettings(), slots=slots)
+    for k in range(4 * 96):
+        core.receive_odometry(
+            Odometry(
+                time_s=k * 0.25,
+                velocity_north_mps=1.0,
+                velocity_east_mps=0.0,
+                yaw_rad=0.0,
+                depth_m=0.0,
+            )
+        )
+    frames = [[core.poll(now_s) for _ in range(3)] for now_s in (80.0, 84.0, 88.0, 96.5, 104.0)]
+    counts = [sum(frame is not None for frame in three) for three in frames]
+    assert counts == [2, 0, 2, 0, 2]
+    assert core.status()["slots_missed"] == 1
+    headers = [decode(frame).header for three in frames for frame in three if frame is not None]
+    assert [header.tx_second for header in headers] == [0, 0, 8, 8, 8, 8]
+
+
+@pytest.mark.slow
+def test_a_mission_on_emulated_micromodems_at_rate_4(tmp_path: Path) -> None:
+    short = ["duration_min=4", "follower_duration_min=4", "leg_m=100", "beams=32"]
+    changes = [*short, *PAIRS, "frames_per_slot=2"]
+    arguments = [part for change in changes for part in ("--set", change)]
+    for name in ("one", "two"):
+        assert (
+            main(["demo", "--modems", "micromodem", "--out", str(tmp_path / name), *arguments]) == 0
+        )
+    air = (tmp_path / "one" / "air.jsonl").read_text()
+    assert air == (tmp_path / "two" / "air.jsonl").read_text()
+    frames = [json.loads(line) for line in air.splitlines()]
+    ours = [frame for frame in frames if frame["source"] == 1 and len(frame["hex"]) == 512]
+    starts = [frame["t_tx_s"] for frame in ours]
+    assert len(ours) >= 30
+    assert starts[::2] == starts[1::2]
+    assert all(start % 8.0 == 0.0 for start in starts)
+    assert {f["fate"] for f in ours[::2]} >= {"delivered", "lost"}
+    assert [f["fate"] for f in ours[::2]] == [f["fate"] for f in ours[1::2]]
+    leader = json.loads((tmp_path / "one" / "processes" / "leader.json").read_text())
+    assert leader["ranges_used"] >= 10

@@ -195,9 +195,14 @@ class PoseGraph:
         )
         return self._enter(record, active=active)
 
-    def add_range(self, origin: Anchor, target: Anchor, range_m: float) -> int:
-        """Enter a one-way range between two anchors, active, and return its number."""
-        sigma_m = self._settings.range_sigma_m
+    def add_range(
+        self, origin: Anchor, target: Anchor, range_m: float, spread_m: float = 0.0
+    ) -> int:
+        """Enter a one-way range between two anchors, active, and return its number.
+
+        spread_m is its sigma beside that of the settings.
+        """
+        sigma_m = float(np.hypot(self._settings.range_sigma_m, spread_m))
         return self._enter(
             RangeRecord(origin=origin, target=target, range_m=range_m, sigma_m=sigma_m)
         )

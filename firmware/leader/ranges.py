@@ -49,6 +49,12 @@ class RangeSettings(Settings):
     held: int = setting(
         256, "ranges", "waiting for their sender's track: two minutes of four followers", minimum=16
     )
+    bent_m: float = setting(
+        1.0, "m", "bend of a range up to which it is linear: its own noise (Eq. 13)", minimum=0.01
+    )
+    bent_windows: int = setting(
+        64, "windows", "of 20 s that wait until closures have straightened them", minimum=1
+    )
     certainty: float = setting(
         0.99, "1", "share of belief that one explanation must have", minimum=0.5, maximum=1.0
     )

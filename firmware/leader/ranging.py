@@ -43,6 +43,7 @@ class Ranging:
         self._settings = settings
         self._judge = RangeJudge(settings)
         self._held: deque[_HeldRange] = deque(maxlen=settings.held)
+        self._bent: dict[int, deque[list[_HeldRange]]] = {}
 
     def hold(self, chain: int, header: Header, toa_s: float) -> None:
         """Keep the range that a frame's arrival tells, until its sender's track is known."""
@@ -61,46 +62,85 @@ class Ranging:
     def use(
         self, chain: int, track: Track, receiver: int, receiver_track: Track, graph: PoseGraph
     ) -> None:
-        """Judge, as one window, the held ranges whose both ends are known; enter the good ones."""
+        """Judge, as one window, the held ranges whose both ends are known; enter the good ones.
+
+        While the vehicles may lie so far across the line of sight that a range bends, the window
+        waits; once one does not, those that waited are tried again, newest first.
+        """
         end_s = float(track.time_s[-1])
         ready = [r for r in self._held if r.chain == chain and r.sent_s <= end_s]
         if not ready:
             return
         self._held = deque((r for r in self._held if r not in ready), self._held.maxlen)
         graph.update()
+        waiting = self._bent.setdefault(chain, deque(maxlen=self._settings.bent_windows))
+        if len(waiting) == waiting.maxlen:
+            self.counters["ranges_given_up"] += len(waiting[0])
+        waiting.append(ready)
+        while waiting:
+            placed = self._placed(waiting[-1], (receiver, receiver_track), (chain, track), graph)
+            if placed and not self._enter(placed, graph):
+                return
+            waiting.pop()
+            graph.update()
+
+    def _placed(
+        self,
+        window: list[_HeldRange],
+        receiver: tuple[int, Track],
+        sender: tuple[int, Track],
+        graph: PoseGraph,
+    ) -> list[_PlacedRange]:
         placed = []
-        for held in ready:
+        for held in window:
             try:
-                here = graph.anchor(receiver, held.arrived_s, receiver_track)
-                there = graph.anchor(chain, held.sent_s, track)
+                here = graph.anchor(receiver[0], held.arrived_s, receiver[1])
+                there = graph.anchor(sender[0], held.sent_s, sender[1])
                 placed.append(_placed(held, here, there, graph))
             except EstimationError:
                 self.counters["ranges_unplaceable"] += 1
-        if placed:
-            self._enter(placed, graph)
+        return placed
 
-    def _enter(self, placed: list[_PlacedRange], graph: PoseGraph) -> None:
-        middle = placed[len(placed) // 2]
-        row = np.concatenate([-middle.direction, middle.direction])
-        variance_m2 = float(row @ graph.covariance([middle.here, middle.there]) @ row)
+    def _enter(self, placed: list[_PlacedRange], graph: PoseGraph) -> bool:
+        """Enter what can be believed of a window; return False if it has to wait."""
+        along_m, bent_m = _spread(placed[len(placed) // 2], graph)
+        if bent_m > self._settings.bent_m:
+            return False
         verdict = self._judge.judge(
             np.array([p.range_m for p in placed]),
             np.array([p.predicted_m for p in placed]),
             np.array([p.there.time_s for p in placed]),
-            float(np.sqrt(max(variance_m2, 1e-6))),
+            float(np.hypot(along_m, bent_m)),
         )
         if not verdict.certain:
             self.counters["ranges_undecided"] += len(placed)
-            return
+            return True
         for k, p in enumerate(placed):
             if verdict.true[k]:
-                graph.add_range(p.here, p.there, p.range_m)
+                graph.add_range(p.here, p.there, p.range_m, bent_m)
                 self.counters["ranges_used"] += 1
             elif verdict.stretched[k]:
-                graph.add_range(p.here, p.there, p.range_m / self._settings.outlier_factor)
+                unstretched_m = p.range_m / self._settings.outlier_factor
+                graph.add_range(p.here, p.there, unstretched_m, bent_m)
                 self.counters["ranges_unstretched"] += 1
             else:
                 self.counters["ranges_rejected"] += 1
+        return True
+
+
+def _spread(placed: _PlacedRange, graph: PoseGraph) -> tuple[float, float]:
+    """Return the sigma of the predicted range, and that of what its linearisation leaves out.
+
+    A range is longer by u^2 / 2r when the vehicles lie u farther across the line of sight. Where
+    that is as large as the range's noise, a linear filter chooses one side of the line and grows
+    sure of it, though the mirror image fits as well.
+    """
+    between = np.hstack([-np.eye(2), np.eye(2)])
+    covariance_m2 = between @ graph.covariance([placed.here, placed.there]) @ between.T
+    along, across = placed.direction, np.array([-placed.direction[1], placed.direction[0]])
+    along_m2 = float(along @ covariance_m2 @ along)
+    bent_m = float(across @ covariance_m2 @ across) / (np.sqrt(2.0) * placed.predicted_m + 1e-3)
+    return float(np.sqrt(max(along_m2, 1e-6))), bent_m
 
 
 def _placed(held: _HeldRange, here: Anchor, there: Anchor, graph: PoseGraph) -> _PlacedRange:

@@ -23,13 +23,25 @@ class Track:
 
     def position_at(self, time_s: Array | float) -> Array:
         """Return north, east (..., 2) at the times, interpolated, held constant beyond the ends."""
+        times_s = np.asarray(time_s, dtype=np.float64)
+        near = slice(None)
+        if times_s.size:
+            first = int(np.searchsorted(self.time_s, times_s.min(), side="right")) - 1
+            last = int(np.searchsorted(self.time_s, times_s.max(), side="left"))
+            near = slice(min(max(first, 0), len(self.time_s) - 1), last + 1)
         return np.stack(
             [
-                np.interp(time_s, self.time_s, self.north_m),
-                np.interp(time_s, self.time_s, self.east_m),
+                np.interp(times_s, self.time_s[near], self.north_m[near]),
+                np.interp(times_s, self.time_s[near], self.east_m[near]),
             ],
             axis=-1,
         )
+
+    def gap_s(self, time_s: float) -> float:
+        """Return how far the nearest state is from a time."""
+        after = int(np.searchsorted(self.time_s, time_s))
+        near_s = self.time_s[max(after - 1, 0) : after + 1]
+        return float(np.min(np.abs(near_s - time_s)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware.geometry import Array
-from firmware.leader.closures import Closure
+from firmware.leader.closure_log import Verdict
 from firmware.leader.core import LeaderCore
 from firmware.leader.trajectory import Trajectory
 from host_tools.mapping import DepthMap
@@ -50,7 +50,7 @@ def leader_record(leader: LeaderCore, time_s: Array, window: Window) -> LeaderRe
     return LeaderRecord(
         trajectories={vehicle: leader.trajectory(vehicle) for vehicle in vehicles},
         covariances_m2={v: final_covariances(v, time_s, leader) for v in vehicles},
-        closures=[closure_result(closure) for closure in leader.closures],
+        closures=[closure_result(verdict) for verdict in leader.verdicts()],
         patches=sheet_patches(leader, window),
     )
 
@@ -156,17 +156,17 @@ def final_covariances(vehicle: int, time_s: Array, leader: LeaderCore) -> Array:
     return covariances_m2
 
 
-def closure_result(closure: Closure) -> ClosureResult:
+def closure_result(closure: Verdict) -> ClosureResult:
     """Return a closure of the leader as a line of the results."""
     sigmas_m = np.sqrt(np.diag(closure.covariance_m2))
     return ClosureResult(
         t_s=closure.time_s,
         from_vehicle=closure.origin.vehicle,
         from_submap=closure.origin.submap,
-        from_time_s=closure.origin_anchor.time_s,
+        from_time_s=closure.origin_time_s,
         to_vehicle=closure.target.vehicle,
         to_submap=closure.target.submap,
-        to_time_s=closure.target_anchor.time_s,
+        to_time_s=closure.target_time_s,
         measured_north_m=float(closure.offset_m[0]),
         measured_east_m=float(closure.offset_m[1]),
         sigma_north_m=float(sigmas_m[0]),
@@ -180,5 +180,5 @@ def closure_result(closure: Closure) -> ClosureResult:
 
 def sheet_patches(leader: LeaderCore, window: Window) -> Iterator[SoundingPatch]:
     """Yield every sub-map that the leader holds as a patch of the map."""
-    for sheet in leader.atlas:
-        yield patch_of_grid(sheet.id.vehicle, sheet.grid, window)
+    for vehicle, grid in leader.atlas.grids():
+        yield patch_of_grid(vehicle, grid, window)

@@ -3,10 +3,12 @@
 from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from firmware.geometry import Array
+from firmware.leader.shelf import MemoryShelf, Shelf, packed, unpacked
 from firmware.leader.trajectory import Trajectory
 from firmware.leader.warping import remove_drift
 from firmware.submaps import GriddedSubmap, Track
@@ -102,12 +104,21 @@ def overlap_m2(origin: Sheet, target: Sheet, shifts_m: Array) -> Array:
 
 
 class Atlas:
-    """Sheets by id in the order of their arrival; the oldest go when the cap is reached."""
+    """Sheets to match with, by id in the order of their arrival; the others are on the shelf.
 
-    def __init__(self, capacity: int) -> None:
+    The oldest leave for good when there are more than the cap of all together.
+    """
+
+    def __init__(self, capacity: int, shelf: Shelf | None = None) -> None:
         self._capacity = capacity
         self._sheets: OrderedDict[SheetId, Sheet] = OrderedDict()
+        self._shelved: OrderedDict[SheetId, None] = OrderedDict()
+        self.shelf = MemoryShelf() if shelf is None else shelf
         self.dropped = 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a checkpoint holds: all but the shelf, which is on a disk of its own."""
+        return {name: value for name, value in self.__dict__.items() if name != "shelf"}
 
     def __len__(self) -> int:
         return len(self._sheets)
@@ -121,9 +132,34 @@ class Atlas:
     def __getitem__(self, sheet_id: SheetId) -> Sheet:
         return self._sheets[sheet_id]
 
+    @property
+    def shelved(self) -> int:
+        """How many sheets are on the shelf."""
+        return len(self._shelved)
+
     def add(self, sheet: Sheet) -> None:
         """Keep a sheet; a better version of a known one takes its place."""
+        self._shelved.pop(sheet.id, None)
         self._sheets[sheet.id] = sheet
-        if len(self._sheets) > self._capacity:
-            self._sheets.popitem(last=False)
+        if len(self._sheets) + len(self._shelved) > self._capacity:
+            oldest = self._shelved or self._sheets
+            oldest.popitem(last=False)
             self.dropped += 1
+
+    def shelve(self, sheet_id: SheetId) -> None:
+        """Put a sheet away: it is matched no more, but stays part of the map."""
+        self.shelf.put(_name(sheet_id), packed(self._sheets.pop(sheet_id).grid))
+        self._shelved[sheet_id] = None
+
+    def grids(self) -> Iterator[tuple[int, GriddedSubmap]]:
+        """Yield vehicle and grid of every sheet that can be had, those of the shelf first."""
+        for sheet_id in self._shelved:
+            body = self.shelf.get(_name(sheet_id))
+            if body is not None:
+                yield sheet_id.vehicle, unpacked(body)
+        for sheet in self:
+            yield sheet.id.vehicle, sheet.grid
+
+
+def _name(sheet_id: SheetId) -> str:
+    return f"{sheet_id.vehicle}/{sheet_id.boot_epoch}/{sheet_id.submap}"

@@ -4,42 +4,95 @@ import bisect
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from firmware.geometry import Array
-from firmware.leader.ledger import SharedWalkRecord
+from firmware.leader.ledger import OdometryRecord, SharedWalkRecord
+from firmware.leader.trajectory import Trajectory
 
 
 @dataclass(slots=True)
 class Chain:
-    """The nodes of one vehicle, in time order, and the key of its parameters."""
+    """The nodes of one vehicle, in time order, and the key of its parameters.
+
+    `shape` is the estimate, as it was, of the part of which only some nodes are left.
+    """
 
     number: int
     parameters: int
     times_s: list[float] = field(default_factory=list)
     reckoned_m: list[Array] = field(default_factory=list)
     keys: list[int] = field(default_factory=list)
+    added: int = 0
+    shape: Trajectory | None = None
 
     def key_at(self, time_s: float) -> int | None:
         """Return the key of the node at exactly this time, or None."""
         at = bisect.bisect_left(self.times_s, time_s)
         return self.keys[at] if at < len(self.times_s) and self.times_s[at] == time_s else None
 
+    def nearest(self, time_s: float) -> int:
+        """Return the index of the node nearest to a time, the earlier of two."""
+        after = bisect.bisect_left(self.times_s, time_s)
+        if after in (0, len(self.times_s)):
+            return max(after - 1, 0)
+        return after - (time_s - self.times_s[after - 1] <= self.times_s[after] - time_s)
+
+    def trajectory(self, states: Array) -> Trajectory:
+        """Return the estimate at all nodes ever, from the states (K, 4) of those that are left."""
+        times_s, reckoned_m = np.array(self.times_s), np.array(self.reckoned_m)
+        whole = Trajectory(
+            time_s=times_s,
+            reckoned_m=reckoned_m,
+            position_m=states[:, :2],
+            bias_mps=states[:, 2:],
+        )
+        return whole if self.shape is None else self.shape.carried_by(whole)
+
+    def drop(self, kept: NDArray[np.bool_], trajectory: Trajectory) -> dict[int, int]:
+        """Leave some nodes (K,) only; return to which of them each dropped one is nearest."""
+        gone = [key for key, stays in zip(self.keys, kept, strict=True) if not stays]
+        gone_s = [time_s for time_s, stays in zip(self.times_s, kept, strict=True) if not stays]
+        stay = np.flatnonzero(kept)
+        self.times_s = [self.times_s[k] for k in stay]
+        self.reckoned_m = [self.reckoned_m[k] for k in stay]
+        self.keys = [self.keys[k] for k in stay]
+        self.shape = trajectory
+        return {
+            key: self.keys[self.nearest(time_s)] for key, time_s in zip(gone, gone_s, strict=True)
+        }
+
+    def odometry(
+        self, before: int, after: int, odometry_noise: float, bias_walk: float
+    ) -> OdometryRecord:
+        """Return dead reckoning between two nodes by their index."""
+        interval_s = self.times_s[after] - self.times_s[before]
+        variance_m2 = odometry_noise**2 * interval_s + bias_walk**2 * interval_s**3 / 3
+        return OdometryRecord(
+            origin=self.keys[before],
+            target=self.keys[after],
+            parameters=self.parameters,
+            moved_m=self.reckoned_m[after] - self.reckoned_m[before],
+            interval_s=interval_s,
+            position_sigma_m=float(np.sqrt(variance_m2)),
+            bias_sigma_mps=float(bias_walk * np.sqrt(interval_s)),
+        )
+
 
 def shared_walk(
-    first: Chain, chain: Chain, interval_s: float, bias_walk_apart: float
+    first: Chain, chain: Chain, begin_s: float, end_s: float, bias_walk_apart: float
 ) -> list[SharedWalkRecord]:
     """Return that a chain's bias has changed over an interval as the first chain's has.
 
-    It ends at the chain's newest node; nothing is said when one of the four nodes is not there.
+    Nothing is said when one of the four nodes is not there.
     """
-    end_s = chain.times_s[-1]
-    if chain is first or end_s % interval_s:
+    if chain is first:
         return []
-    origins = first.key_at(end_s - interval_s), chain.key_at(end_s - interval_s)
+    origins = first.key_at(begin_s), chain.key_at(begin_s)
     targets = first.key_at(end_s), chain.key_at(end_s)
     if origins[0] is None or origins[1] is None or targets[0] is None or targets[1] is None:
         return []
-    sigma_mps = bias_walk_apart * float(np.sqrt(interval_s))
+    sigma_mps = bias_walk_apart * float(np.sqrt(end_s - begin_s))
     return [
         SharedWalkRecord(
             origins=(origins[0], origins[1]), targets=(targets[0], targets[1]), sigma_mps=sigma_mps

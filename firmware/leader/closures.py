@@ -22,6 +22,12 @@ class ClosureSettings(Settings):
     pairs_per_submap: int = setting(
         12, "pairs", "bounds the work of one sub-map to a tenth of a second", minimum=1
     )
+    known_pairs_per_submap: int = setting(
+        3, "pairs", "of those whose offset is known already; more would say it again", minimum=1
+    )
+    known_sigma_m: float = setting(
+        2.0, "m", "an offset so well known is known; a match tells it to half a metre", minimum=0.1
+    )
     screened_per_submap: int = setting(
         48, "sub-maps", "nearest ones whose joint covariance is asked for", minimum=1
     )
@@ -118,7 +124,7 @@ def jobs_for(
     calibrations = calibrations or Calibrations(matching)
     target = side_of(sheet, graph.trajectory(sheet.id.chain))
     pairs = []
-    for other, covariance_m2 in _ranked(sheet, atlas, graph, settings)[: settings.pairs_per_submap]:
+    for other, covariance_m2 in _worth_trying(_ranked(sheet, atlas, graph, settings), settings):
         origin = side_of(other, graph.trajectory(other.id.chain))
         shift_m = _correction(sheet, graph) - _correction(other, graph)
         calibrations.learn(origin, target, shift_m, covariance_m2)
@@ -195,26 +201,47 @@ def enter_hint(
     )
 
 
-def gate(closure: Closure, graph: PoseGraph, settings: ClosureSettings) -> bool:
-    """Enter a closure in the ledger if the graph finds its innovation possible; say whether."""
-    joint_m2 = graph.covariance([closure.origin_anchor, closure.target_anchor])
+def gated(closures: list[Closure], graph: PoseGraph, settings: ClosureSettings) -> list[Closure]:
+    """Enter in the ledger those closures whose innovation the graph finds possible; return them.
+
+    Raises EstimationError if the graph can say nothing.
+    """
+    if not closures:
+        return []
+    anchors = [anchor for c in closures for anchor in (c.origin_anchor, c.target_anchor)]
+    joint_m2 = graph.covariance(anchors)
     between = np.hstack([-np.eye(2), np.eye(2)])
-    spread_m2 = between @ joint_m2 @ between.T + closure.covariance_m2
-    predicted_m = graph.position(closure.target_anchor) - graph.position(closure.origin_anchor)
-    innovation_m = closure.offset_m - predicted_m
-    if innovation_m @ np.linalg.solve(spread_m2, innovation_m) > settings.gate_chi_square:
-        return False
-    closure.stage = Stage.GATED
-    prior_m2 = spread_m2 - closure.covariance_m2
-    closure.predicted_sigma_m = float(np.sqrt(max(np.linalg.eigvalsh(prior_m2)[-1], 0.0)))
-    closure.number = graph.add_closure(
-        closure.origin_anchor,
-        closure.target_anchor,
-        closure.offset_m,
-        closure.covariance_m2,
-        active=False,
-    )
-    return True
+    passed = []
+    for k, closure in enumerate(closures):
+        ends = slice(4 * k, 4 * k + 4)
+        prior_m2 = between @ joint_m2[ends, ends] @ between.T
+        spread_m2 = prior_m2 + closure.covariance_m2
+        predicted_m = graph.position(closure.target_anchor) - graph.position(closure.origin_anchor)
+        innovation_m = closure.offset_m - predicted_m
+        if innovation_m @ np.linalg.solve(spread_m2, innovation_m) > settings.gate_chi_square:
+            continue
+        closure.stage = Stage.GATED
+        largest_m2 = float(np.linalg.eigvalsh(prior_m2)[-1])
+        closure.predicted_sigma_m = float(np.sqrt(max(largest_m2, 0.0)))
+        closure.number = graph.add_closure(
+            closure.origin_anchor,
+            closure.target_anchor,
+            closure.offset_m,
+            closure.covariance_m2,
+            active=False,
+        )
+        passed.append(closure)
+    return passed
+
+
+def corrections(sheets: list[Sheet], graph: PoseGraph) -> Array:
+    """Return what is to be added (S, 2) to each sheet's dead reckoning at its time."""
+    found_m, chains = np.zeros((len(sheets), 2)), np.array([sheet.id.chain for sheet in sheets])
+    times_s = np.array([sheet.time_s for sheet in sheets])
+    for chain in dict.fromkeys(chains.tolist()):
+        rows = np.flatnonzero(chains == chain)
+        found_m[rows] = graph.trajectory(chain).correct(times_s[rows], np.zeros((rows.size, 2)))
+    return found_m
 
 
 def _correction(sheet: Sheet, graph: PoseGraph) -> Array:
@@ -223,24 +250,26 @@ def _correction(sheet: Sheet, graph: PoseGraph) -> Array:
     return trajectory.correct(sheet.time_s, reckoned_m) - reckoned_m
 
 
-def _estimated_centre(sheet: Sheet, graph: PoseGraph) -> Array:
-    return sheet.centre_m + _correction(sheet, graph)
-
-
 def _ranked(
     sheet: Sheet, atlas: Atlas, graph: PoseGraph, settings: ClosureSettings
 ) -> list[tuple[Sheet, Array]]:
     """Return the sheets that may overlap a new one, most first, with the offset's covariance."""
-    here_m = _estimated_centre(sheet, graph)
-    others, distances_m, anchors = [], [], [_anchor(sheet, graph)]
-    for other in atlas:
-        apart_s = abs(other.time_s - sheet.time_s)
-        if other.id == sheet.id or (
-            other.id.vehicle == sheet.id.vehicle and apart_s < settings.shortest_gap_s
-        ):
-            continue
-        others.append(other)
-        distances_m.append(float(np.hypot(*(_estimated_centre(other, graph) - here_m))))
+    others = [
+        other
+        for other in atlas
+        if other.id != sheet.id
+        and (
+            other.id.vehicle != sheet.id.vehicle
+            or abs(other.time_s - sheet.time_s) >= settings.shortest_gap_s
+        )
+    ]
+    if not others:
+        return []
+    moves_m = corrections(others, graph)
+    centres_m = np.array([other.centre_m for other in others]) + moves_m
+    own_m = _correction(sheet, graph)
+    distances_m = np.hypot(*(centres_m - sheet.centre_m - own_m).T)
+    anchors = [_anchor(sheet, graph)]
     nearest = np.argsort(distances_m, kind="stable")[: settings.screened_per_submap]
     anchors += [_anchor(others[k], graph) for k in nearest]
     joint_m2 = graph.covariance(anchors).reshape(len(anchors), 2, len(anchors), 2)
@@ -248,12 +277,25 @@ def _ranked(
     for position, k in enumerate(nearest, start=1):
         cross_m2 = joint_m2[0, :, position]
         covariance_m2 = joint_m2[0, :, 0] + joint_m2[position, :, position] - cross_m2 - cross_m2.T
-        shift_m = _correction(sheet, graph) - _correction(others[k], graph)
+        shift_m = own_m - moves_m[k]
         area_m2 = overlap_m2(others[k], sheet, shift_m + _spread(covariance_m2)).mean()
         if area_m2 >= settings.expected_overlap_m2:
             ranked.append((area_m2, others[k], covariance_m2))
     ranked.sort(key=lambda item: -item[0])
     return [(other, covariance_m2) for _, other, covariance_m2 in ranked]
+
+
+def _worth_trying(
+    ranked: list[tuple[Sheet, Array]], settings: ClosureSettings
+) -> list[tuple[Sheet, Array]]:
+    """Return the first of the ranked pairs, but few whose offset is known before the match."""
+    chosen, known = [], 0
+    for other, covariance_m2 in ranked:
+        is_known = np.linalg.eigvalsh(covariance_m2)[-1] <= settings.known_sigma_m**2
+        known += bool(is_known)
+        if not is_known or known <= settings.known_pairs_per_submap:
+            chosen.append((other, covariance_m2))
+    return chosen[: settings.pairs_per_submap]
 
 
 def _spread(covariance_m2: Array) -> Array:

@@ -7,7 +7,7 @@ closures -> gate -> consistency -> ledger -> update -> answer.
 import dataclasses
 import math
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,18 @@ from firmware.belief import Belief
 from firmware.dead_reckoning import DeadReckoning, ReckonedState
 from firmware.leader.answers import Answers
 from firmware.leader.atlas import LEADER, Atlas, Sheet, SheetId, sheet_of
-from firmware.leader.closures import Closure, MatchJob, closure_of, enter_hint, gate, jobs_for
+from firmware.leader.closure_log import ClosureLog, Verdict, verdict_of
+from firmware.leader.closures import (
+    Closure,
+    MatchJob,
+    closure_of,
+    corrections,
+    enter_hint,
+    gated,
+    jobs_for,
+)
+from firmware.leader.composition import detail_from_s
+from firmware.leader.coverage import redundant
 from firmware.leader.fleet import Fleet
 from firmware.leader.judgement import Judgement
 from firmware.leader.ledger import Anchor
@@ -31,6 +42,7 @@ from firmware.leader.reconstruction import (
     states_of_fragment,
 )
 from firmware.leader.settings import LeaderSettings, patient_reassembly
+from firmware.leader.shelf import Shelf
 from firmware.leader.trajectory import Trajectory
 from firmware.soundings import Odometry, Ping
 from firmware.submap_builder import SubmapBuilder
@@ -76,13 +88,15 @@ class LeaderCore:
         settings: LeaderSettings,
         slots: Slots,
         rebuild: Rebuild | None = None,
+        shelf: Shelf | None = None,
     ) -> None:
         self.boot_epoch = boot_epoch
-        self._rebuild = self._reconstruct if rebuild is None else rebuild
+        self._rebuild = rebuild
         self.counters: Counter[str] = Counter()
-        self.closures: list[Closure] = []
+        self._closures: list[Closure] = []  # on which something may yet be decided
+        self._settled = ClosureLog()
         self.graph = PoseGraph(settings.graph)
-        self.atlas = Atlas(settings.atlas_submaps)
+        self.atlas = Atlas(settings.atlas_submaps, shelf)
         self._settings, self._slots = settings, slots
         self._reckoning = DeadReckoning(start)
         self._builder = SubmapBuilder(
@@ -103,6 +117,8 @@ class LeaderCore:
         self._calibrations = Calibrations(settings.matching)
         self._judgement = Judgement(settings.judgement, settings.matching, self._calibrations)
         self._sheets_judged = 0
+        self._jobs_out = False
+        self.composed_s = start.time_s
         self._sheets_to_match: deque[Sheet] = deque(maxlen=16)
         self._ranges_used_s: dict[int, float] = {}
         self._next_slot_s = slots.next_slot_s(LEADER, start.time_s)
@@ -160,12 +176,17 @@ class LeaderCore:
                 self._receive_fragment(event.fragment, now_s)
             else:
                 self._add_transfer(event)
+        interval_s = self._settings.composition.interval_s
+        if now_s - self.composed_s >= interval_s and not self._jobs_out:
+            self.composed_s = now_s
+            self._compose(now_s)
 
     def next_jobs(self) -> SheetJobs | None:
         """Return the matches of the oldest sheet that still waits for them, or None."""
         if not self._sheets_to_match:
             return None
         self.graph.update()
+        self._jobs_out = True
         sheet = self._sheets_to_match.popleft()
         jobs = jobs_for(
             sheet,
@@ -179,7 +200,7 @@ class LeaderCore:
 
     def finish(self, done: SheetJobs, outcomes: list[MatchOutcome], now_s: float) -> None:
         """Judge what the matches of one sheet found, and bring the estimate up to it."""
-        gated = []
+        found = []
         for job, outcome in zip(done.jobs, outcomes, strict=True):
             if outcome.reason is not None:
                 self.counters[f"match_{outcome.reason.name.lower()}"] += 1
@@ -189,18 +210,23 @@ class LeaderCore:
                         enter_hint(job, outcome.hint, self.graph, self._settings.closures)
                     )
                 closure = closure_of(job, outcome, self.graph, now_s)
-                if closure is None:
-                    continue
-                self.closures.append(closure)
-                if gate(closure, self.graph, self._settings.closures):
-                    gated.append(closure)
             except EstimationError:
                 self.counters["closures_unplaceable"] += 1
-        self._judgement.consider(gated, self.atlas, self.graph)
+                continue
+            if closure is not None:
+                found.append(closure)
+        self._closures += found
+        try:
+            passed = gated(found, self.graph, self._settings.closures)
+        except EstimationError:
+            self.counters["closures_unplaceable"] += len(found)
+            passed = []
+        self._judgement.consider(passed, self.atlas, self.graph)
         self.graph.update()
+        self._jobs_out = False
         self._sheets_judged += 1
         if self._sheets_judged % self._settings.sheets_between_audits == 0:
-            self._judgement.audit(self.closures, self.graph)
+            self._judgement.audit(self._closures, self.graph)
             self.graph.update()
 
     # what goes out
@@ -235,6 +261,11 @@ class LeaderCore:
     def vehicles(self) -> list[int]:
         """Return the vehicles whose trajectories are known, the leader first."""
         return self.fleet.vehicles()
+
+    def verdicts(self) -> Iterator[Verdict]:
+        """Yield every closure that was detected, and how far it has come."""
+        yield from self._settled
+        yield from map(verdict_of, self._closures)
 
     def track(self, vehicle: int) -> Track:
         """Return the raw dead-reckoned track of a vehicle, as far as it is known here."""
@@ -275,6 +306,25 @@ class LeaderCore:
 
     # inside
 
+    def _compose(self, now_s: float) -> None:
+        """Make the past coarse, so that a day costs no more an hour than its first hours."""
+        settings = self._settings.composition
+        self.graph.compose(now_s, settings)
+        detail_s = detail_from_s(now_s, settings)
+        self._judgement.forget(detail_s, self.graph)
+        open_closures = []
+        for closure in self._closures:
+            if closure.number in self.graph:
+                open_closures.append(closure)
+            else:
+                self._settled.add(closure)
+        self._closures = open_closures
+        self.fleet.settle(detail_s)
+        old = [sheet for sheet in self.atlas if sheet.time_s < detail_s]
+        moves_m = corrections(old, self.graph)
+        for sheet_id in redundant(old, moves_m, self._settings.coverage):
+            self.atlas.shelve(sheet_id)
+
     def _add_own(self, stretch: Submap) -> None:
         """Join the newest stretches to a sub-map, so that one ends every hop."""
         self.graph.extend(LEADER, self.fleet.own.track())
@@ -294,7 +344,7 @@ class LeaderCore:
         sheet_id = SheetId(vehicle=header.vehicle, boot_epoch=boot, submap=header.submap)
         self._use_ranges(sheet_id.chain)
         try:
-            rebuilt = self._rebuild(transfer)
+            rebuilt = (self._rebuild or self._reconstruct)(transfer)
         except EstimationError:
             self.counters["submaps_not_rebuilt"] += 1
             return

@@ -123,6 +123,11 @@ class Fleet:
         if chain in self._graph.vehicles():
             self._ranging.use(chain, self.track(chain), LEADER, self.own.track(), self._graph)
 
+    def settle(self, before_s: float) -> None:
+        """Let the tracks forget what only late frames could ask for."""
+        for buffer in self._tracks.values():
+            buffer.settle(before_s)
+
     def track(self, chain: int) -> Track:
         """Return the raw dead-reckoned track of a chain."""
         return self._tracks[chain].track()

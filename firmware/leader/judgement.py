@@ -123,8 +123,15 @@ class Judgement:
             fits = graph.chi_square(number) < self._settings.accept_chi_square
             graph.set_active(number, active=fits)
 
+    def forget(self, before_s: float, graph: PoseGraph) -> None:
+        """Wait no longer for closures found before a time, nor doubt hints that the graph let go."""
+        self._hints = deque((n for n in self._hints if n in graph), self._settings.hints)
+        waiting = [c for c in self._waiting if c.time_s >= before_s]
+        self.counters["closures_given_up"] += len(self._waiting) - len(waiting)
+        self._waiting = deque(waiting, self._settings.waiting)
+
     def _believe(self, closure: Closure, graph: PoseGraph, reason: str) -> None:
-        if closure.number is None:
+        if closure.number is None or closure.number not in graph:
             return
         closure.stage, closure.active = Stage.CONSISTENT, True
         graph.set_active(closure.number, active=True)

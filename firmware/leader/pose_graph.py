@@ -9,15 +9,22 @@ The ISAM2 object is a cache of the ledger: poisoned as soon as it raises, and re
 """
 
 import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import gtsam
 import numpy as np
-from scipy import sparse
-from scipy.sparse.linalg import SuperLU, splu
 
 from firmware.geometry import Array
 from firmware.leader.chains import Chain, shared_walk
+from firmware.leader.composition import (
+    Composition,
+    CompositionSettings,
+    detail_from_s,
+    kept_nodes,
+    pinned_keys,
+)
 from firmware.leader.factors import factor_of
 from firmware.leader.ledger import (
     AbsoluteRecord,
@@ -29,6 +36,7 @@ from firmware.leader.ledger import (
     RangeRecord,
     Record,
     SharedDriftRecord,
+    SharedWalkRecord,
 )
 from firmware.leader.solver import new_isam
 from firmware.leader.trajectory import Trajectory
@@ -36,6 +44,8 @@ from firmware.submaps import Track
 from protocol.errors import EstimationError
 from protocol.settings import Settings, setting
 
+_Kind = TypeVar("_Kind", bound=Record)
+_PLAIN = ("_settings", "_chains", "_ledger", "_entered", "_factorization", "rebuilds")
 _SETTLING_STEPS = 4  # a robust weight follows its residual one step late
 
 
@@ -88,16 +98,37 @@ class PoseGraph:
     def __init__(self, settings: GraphSettings) -> None:
         self._settings = settings
         self._chains: dict[int, Chain] = {}
-        self._ledger: list[Entry] = []
+        self._ledger: dict[int, Entry] = {}
+        self._entered = 0
         self._changed: set[int] = set()
         self._values = gtsam.Values()
         self._fresh = gtsam.Values()
         self._factorization = "CHOLESKY"  # until it calls a long chain indeterminate: then QR
         self._isam = new_isam(self._factorization)
-        self._factorised: tuple[SuperLU, dict[int, int]] | None = None
         self._trajectories: dict[int, Trajectory] = {}  # both until the next change
         self._newest_covariance: dict[int, Array] = {}
         self.rebuilds = 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the graph as plain data, to be taken just after `compose`.
+
+        ISAM2 is built again from the point about which it was linearised, so that it is the same.
+        """
+        if self._changed or self._fresh.size():
+            raise TypeError("the graph has news that ISAM2 does not know")
+        about = self._isam.getLinearizationPoint()
+        state = {name: self.__dict__[name] for name in _PLAIN}
+        return state | {"about": {key: about.atVector(key) for key in about.keys()}}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        about = gtsam.Values()
+        for key, vector in state.pop("about").items():
+            about.insert(key, vector)
+        self.__dict__.update(state)
+        self._changed, self._fresh = set(), gtsam.Values()
+        self._trajectories, self._newest_covariance = {}, {}
+        self._rebuild(about)
+        self.rebuilds = state["rebuilds"]
 
     def add_vehicle(
         self,
@@ -127,7 +158,7 @@ class PoseGraph:
         self._enter(PriorRecord(key=chain.parameters, mean=np.zeros(2), sigmas=calibration))
         if number > 0:
             first = next(iter(self._chains.values())) if like is None else self._chains[like]
-            nearest = int(np.argmin(np.abs(np.asarray(first.times_s) - time_s)))
+            nearest = first.nearest(time_s)
             gap_s = abs(time_s - first.times_s[nearest])
             wandered_mps = float(s.bias_walk * np.sqrt(gap_s + s.node_interval_s))
             self._enter(
@@ -155,11 +186,10 @@ class PoseGraph:
         added = 0
         for epoch in range(begin, end + 1):
             time_s = epoch * interval_s
-            if np.min(np.abs(track.time_s - time_s)) <= interval_s / 2:
+            if track.gap_s(time_s) <= interval_s / 2:
                 self._step(chain, time_s, track.position_at(time_s))
-                first = next(iter(self._chains.values()))
-                for tie in shared_walk(first, chain, s.alike_interval_s, s.bias_walk_apart):
-                    self._enter(tie)
+                if time_s % s.alike_interval_s == 0.0:
+                    self._tie(chain, time_s - s.alike_interval_s, time_s)
                 added += 1
         return added
 
@@ -171,16 +201,18 @@ class PoseGraph:
         if vehicle not in self._chains:
             raise EstimationError(f"vehicle {vehicle} has no chain in the graph")
         chain = self._chains[vehicle]
-        nearest = int(np.argmin(np.abs(np.asarray(chain.times_s) - time_s)))
-        lag_s = time_s - chain.times_s[nearest]
+        nearest = chain.nearest(time_s)
+        key, lag_s = chain.keys[nearest], time_s - chain.times_s[nearest]
+        if chain.shape is not None and time_s < chain.shape.time_s[-1]:
+            return self._anchor_in_shape(vehicle, key, time_s, track)
         if abs(lag_s) > 2 * self._settings.node_interval_s:
             raise EstimationError(
                 f"vehicle {vehicle} has no node near {time_s:.1f} s; the nearest is at "
                 f"{chain.times_s[nearest]:.1f} s"
             )
-        bias_mps = self._state(chain.keys[nearest])[2:]
+        bias_mps = self._state(key)[2:]
         moved_m = track.position_at(time_s) - chain.reckoned_m[nearest]
-        return Anchor(key=chain.keys[nearest], offset_m=moved_m - bias_mps * lag_s, time_s=time_s)
+        return Anchor(key=key, offset_m=moved_m - bias_mps * lag_s, time_s=time_s)
 
     def add_closure(
         self, origin: Anchor, target: Anchor, offset_m: Array, covariance_m2: Array, *, active: bool
@@ -224,6 +256,19 @@ class PoseGraph:
         """Return a record of the ledger."""
         return self._ledger[number].record
 
+    def __contains__(self, number: object) -> bool:
+        return number in self._ledger
+
+    @property
+    def records(self) -> int:
+        """How many records the ledger holds."""
+        return len(self._ledger)
+
+    @property
+    def nodes(self) -> int:
+        """How many nodes there are."""
+        return sum(len(chain.keys) for chain in self._chains.values())
+
     def update(self) -> None:
         """Bring the estimate up to the ledger: incrementally, or from scratch if gtsam gives up."""
         if not self._changed and self._fresh.size() == 0:
@@ -253,6 +298,36 @@ class PoseGraph:
         self._changed.clear()
         self._forget_solution()
 
+    def compose(self, now_s: float, settings: CompositionSettings) -> None:
+        """Make the past coarse, and restart ISAM2 from the ledger and the estimate."""
+        self.update()
+        positions_m = {
+            key: self._state(key)[:2] for chain in self._chains.values() for key in chain.keys
+        }
+        pinned, detail_s = pinned_keys(self._ledger.values()), detail_from_s(now_s, settings)
+        owners: dict[int, int] = {}
+        for vehicle, chain in self._chains.items():
+            kept = kept_nodes(chain, now_s, pinned, settings)
+            owners |= chain.drop(kept, self.trajectory(vehicle).until(detail_s))
+        apart_m2 = self._apart(owners)
+        old = {
+            key
+            for chain in self._chains.values()
+            for key, time_s in zip(chain.keys, chain.times_s, strict=True)
+            if time_s < detail_s
+        }
+        coarse = Composition(owners, apart_m2, old, positions_m, settings).coarse(self._ledger)
+        self._ledger = dict(coarse.kept)
+        for record in coarse.new:
+            self._enter(record)
+        self._mend()
+        values = gtsam.Values()
+        for chain in self._chains.values():
+            for key in (*chain.keys, chain.parameters):
+                values.insert(key, self._state(key))
+        self._rebuild(values)
+        self._changed.clear()
+
     def solve_batch(self) -> None:
         """Solve the ledger from scratch by Levenberg-Marquardt and restart ISAM2 from there."""
         self.update()
@@ -267,12 +342,7 @@ class PoseGraph:
         if vehicle not in self._trajectories:
             chain = self._chains[vehicle]
             states = np.array([self._state(key) for key in chain.keys])
-            self._trajectories[vehicle] = Trajectory(
-                time_s=np.array(chain.times_s),
-                reckoned_m=np.array(chain.reckoned_m),
-                position_m=states[:, :2],
-                bias_mps=states[:, 2:],
-            )
+            self._trajectories[vehicle] = chain.trajectory(states)
         return self._trajectories[vehicle]
 
     def parameters(self, vehicle: int) -> Array:
@@ -288,21 +358,22 @@ class PoseGraph:
 
         Raises EstimationError if the information matrix is singular.
         """
-        solver, columns = self._factorisation()
-        rows = np.array([columns[a.key] + axis for a in anchors for axis in (0, 1)])
-        unit = np.zeros((solver.shape[0], rows.size))
-        unit[rows, np.arange(rows.size)] = 1.0
-        return np.asarray(solver.solve(unit)[rows])
+        self.update()
+        keys = list(dict.fromkeys(anchor.key for anchor in anchors))
+        try:
+            joint_m2 = self._isam.jointMarginalCovariance(keys).fullMatrix()
+        except RuntimeError as error:
+            raise EstimationError("the information matrix is singular") from error
+        first = dict(zip(keys, range(0, 4 * len(keys), 4), strict=True))
+        rows = [first[anchor.key] + axis for anchor in anchors for axis in (0, 1)]
+        return np.asarray(joint_m2[np.ix_(rows, rows)])
 
     def predicted_covariance(self, vehicle: int, time_s: float) -> Array:
         """Return the covariance (2, 2) in m^2 of a vehicle's position at or after its last node."""
         chain, s = self._chains[vehicle], self._settings
         if vehicle not in self._newest_covariance:
-            solver, columns = self._factorisation()
-            rows = columns[chain.keys[-1]] + np.arange(4)
-            unit = np.zeros((solver.shape[0], 4))
-            unit[rows, np.arange(4)] = 1.0
-            self._newest_covariance[vehicle] = solver.solve(unit)[rows]
+            self.update()
+            self._newest_covariance[vehicle] = self._isam.marginalCovariance(chain.keys[-1])
         ahead_s = max(time_s - chain.times_s[-1], 0.0)
         carry = np.hstack([np.eye(2), -ahead_s * np.eye(2)])
         grown_m2 = s.odometry_noise**2 * ahead_s + s.bias_walk**2 * ahead_s**3 / 3
@@ -330,7 +401,8 @@ class PoseGraph:
         return record
 
     def _append(self, chain: Chain, time_s: float, reckoned_m: Array, state: Array) -> int:
-        key: int = gtsam.symbol("x", (chain.number << 24) | len(chain.keys))
+        key: int = gtsam.symbol("x", (chain.number << 24) | chain.added)
+        chain.added += 1
         chain.times_s.append(time_s)
         chain.reckoned_m.append(np.asarray(reckoned_m, dtype=np.float64))
         chain.keys.append(key)
@@ -340,26 +412,57 @@ class PoseGraph:
         return key
 
     def _step(self, chain: Chain, time_s: float, reckoned_m: Array) -> None:
-        s = self._settings
-        before, interval_s = chain.keys[-1], time_s - chain.times_s[-1]
         moved_m = reckoned_m - chain.reckoned_m[-1]
-        state = self._state(before).copy()
-        state[:2] += moved_m - state[2:] * interval_s
-        self._enter(
-            OdometryRecord(
-                origin=before,
-                target=self._append(chain, time_s, reckoned_m, state),
-                parameters=chain.parameters,
-                moved_m=moved_m,
-                interval_s=interval_s,
-                position_sigma_m=s.odometry_noise * np.sqrt(interval_s),
-                bias_sigma_mps=s.bias_walk * np.sqrt(interval_s),
-            )
-        )
+        state = self._state(chain.keys[-1]).copy()
+        state[:2] += moved_m - state[2:] * (time_s - chain.times_s[-1])
+        self._append(chain, time_s, reckoned_m, state)
+        self._join(chain, len(chain.keys) - 1)
+
+    def _join(self, chain: Chain, node: int) -> None:
+        s = self._settings
+        self._enter(chain.odometry(node - 1, node, s.odometry_noise, s.bias_walk))
+
+    def _tie(self, chain: Chain, begin_s: float, end_s: float) -> None:
+        first, apart = next(iter(self._chains.values())), self._settings.bias_walk_apart
+        for tie in shared_walk(first, chain, begin_s, end_s, apart):
+            self._enter(tie)
+
+    def _apart(self, owners: Mapping[int, int]) -> dict[int, Array]:
+        """Return the covariance (2, 2) of the way between each node and its owner."""
+        keys = list(dict.fromkeys([*owners, *owners.values()]))
+        anchors = [Anchor(key=key, offset_m=np.zeros(2), time_s=0.0) for key in keys]
+        joint_m2 = self.covariance(anchors) if keys else np.zeros((0, 0))
+        rows = {key: slice(2 * k, 2 * k + 2) for k, key in enumerate(keys)}
+        apart_m2 = {}
+        for key, owner in owners.items():
+            a, b = rows[key], rows[owner]
+            apart_m2[key] = joint_m2[a, a] + joint_m2[b, b] - joint_m2[a, b] - joint_m2[b, a]
+        return apart_m2
+
+    def _mend(self) -> None:
+        """Say of dead reckoning and shared walks what is not said between nodes that are left."""
+        joined = {r.target for r in self._records(OdometryRecord)}
+        tied = {(r.origins[1], r.targets[1]) for r in self._records(SharedWalkRecord)}
+        for chain in self._chains.values():
+            for node in range(1, len(chain.keys)):
+                if chain.keys[node] not in joined:
+                    self._join(chain, node)
+            alike_s = self._settings.alike_interval_s
+            told = [k for k, time_s in enumerate(chain.times_s) if time_s % alike_s == 0.0]
+            for before, node in itertools.pairwise(told):
+                if (chain.keys[before], chain.keys[node]) not in tied:
+                    self._tie(chain, chain.times_s[before], chain.times_s[node])
+
+    def _records(self, kind: type[_Kind]) -> list[_Kind]:
+        return [e.record for e in self._ledger.values() if isinstance(e.record, kind)]
+
+    def _anchor_in_shape(self, vehicle: int, key: int, time_s: float, track: Track) -> Anchor:
+        here_m = self.trajectory(vehicle).correct(time_s, track.position_at(time_s))
+        return Anchor(key=key, offset_m=here_m - self._state(key)[:2], time_s=time_s)
 
     def _enter(self, record: Record, *, active: bool = True) -> int:
-        self._ledger.append(Entry(record=record, active=active))
-        number = len(self._ledger) - 1
+        number, self._entered = self._entered, self._entered + 1
+        self._ledger[number] = Entry(record=record, active=active)
         if active:
             self._changed.add(number)
         return number
@@ -370,14 +473,14 @@ class PoseGraph:
 
     def _active_factors(self) -> tuple[gtsam.NonlinearFactorGraph, list[Entry]]:
         graph, entries = gtsam.NonlinearFactorGraph(), []
-        for entry in self._ledger:
+        for entry in self._ledger.values():
             if entry.active:
                 graph.push_back(factor_of(entry.record, self._settings.robust_kernel))
                 entries.append(entry)
         return graph, entries
 
     def _rebuild(self, values: gtsam.Values) -> None:
-        for entry in self._ledger:
+        for entry in self._ledger.values():
             entry.slot = None
         graph, entries = self._active_factors()
         self._isam = new_isam(self._factorization)
@@ -389,28 +492,5 @@ class PoseGraph:
         self.rebuilds += 1
 
     def _forget_solution(self) -> None:
-        self._factorised = None
         self._trajectories.clear()
         self._newest_covariance.clear()
-
-    def _factorisation(self) -> tuple[SuperLU, dict[int, int]]:
-        """Return the factorised information matrix, and the first column of every variable."""
-        if self._changed or self._fresh.size():
-            self.update()
-        if self._factorised is None:
-            linear = self._isam.getFactorsUnsafe().linearize(self._values)
-            rows, columns, entries = linear.sparseJacobian_()
-            keys = sorted(self._values.keys())
-            sizes = [self._values.atVector(key).size for key in keys]
-            first = dict(zip(keys, itertools.accumulate([0, *sizes[:-1]]), strict=True))
-            size = sum(sizes)
-            jacobian = sparse.csr_matrix(
-                (entries, (rows.astype(int) - 1, columns.astype(int) - 1)),
-                shape=(int(rows.max()), size + 1),
-            )[:, :size]
-            try:
-                solver = splu((jacobian.T @ jacobian).tocsc())
-            except RuntimeError as error:
-                raise EstimationError("the information matrix is singular") from error
-            self._factorised = solver, first
-        return self._factorised

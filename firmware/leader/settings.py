@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 from firmware.compression.settings import BinningSettings
 from firmware.leader.closures import ClosureSettings
+from firmware.leader.composition import CompositionSettings
+from firmware.leader.coverage import CoverageSettings
 from firmware.leader.fleet import FleetSettings
 from firmware.leader.judgement import JudgementSettings
 from firmware.leader.matching import MatchingSettings
@@ -35,6 +37,8 @@ class LeaderSettings(Settings):
     )
     ranges: RangeSettings = setting(RangeSettings, "", "one-way travel times")
     graph: GraphSettings = setting(GraphSettings, "", "the pose graph")
+    composition: CompositionSettings = setting(CompositionSettings, "", "the graph's past")
+    coverage: CoverageSettings = setting(CoverageSettings, "", "which sub-maps are matched with")
     fleet: FleetSettings = setting(FleetSettings, "", "the followers' trajectories")
     answers: str = setting(
         "paper",
@@ -43,7 +47,11 @@ class LeaderSettings(Settings):
         choices=("paper", "extended"),
     )
     atlas_submaps: int = setting(
-        5000, "sub-maps", "a day of two vehicles is 4,320", minimum=4, maximum=100_000
+        20_000,
+        "sub-maps",
+        "a day of two vehicles is 6,480; on the shelf 8 kB each",
+        minimum=4,
+        maximum=100_000,
     )
     hop_s: float = setting(
         20.0, "s", "own sub-maps overlap by half: closures come earlier", minimum=4.0

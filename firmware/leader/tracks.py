@@ -18,19 +18,19 @@ class TrackBuffer:
     def __init__(self) -> None:
         self._states: dict[int, tuple[float, float, float, float]] = {}
         self._fresh: list[int] = []
-        self._columns: Array = np.empty((0, 4))
+        self._columns: Array = np.empty((4, 0))
         self._newest: int | None = None
         self.overflowed = 0
 
     def __len__(self) -> int:
-        return len(self._states)
+        return int(self._columns.shape[1]) + len(self._fresh)
 
     def add(self, time_s: float, north_m: float, east_m: float, yaw_rad: float) -> None:
         """Keep a state; a second one for the same quarter second changes nothing."""
         quarter = round(4.0 * time_s)
         if quarter in self._states:
             return
-        if len(self._states) >= _LONGEST_S:
+        if len(self) >= _LONGEST_S:
             self.overflowed += 1
             return
         self._states[quarter] = (time_s, north_m, east_m, yaw_rad)
@@ -57,11 +57,16 @@ class TrackBuffer:
     def track(self) -> Track:
         """Return all states as arrays; sorted again only when an old one arrived late."""
         if self._fresh:
-            rows = np.array([self._states[quarter] for quarter in sorted(self._fresh)])
+            rows = np.array([self._states[quarter] for quarter in sorted(self._fresh)]).T
             self._fresh.clear()
-            merged = np.concatenate([self._columns, rows])
-            if self._columns.size and rows[0, 0] < self._columns[-1, 0]:
-                merged = merged[np.argsort(merged[:, 0], kind="stable")]
+            merged = np.concatenate([self._columns, rows], axis=1)
+            if self._columns.size and rows[0, 0] < self._columns[0, -1]:
+                merged = merged[:, np.argsort(merged[0], kind="stable")]
             self._columns = merged
-        time_s, north_m, east_m, yaw_rad = self._columns.T
+        time_s, north_m, east_m, yaw_rad = self._columns
         return Track(time_s=time_s, north_m=north_m, east_m=east_m, yaw_rad=yaw_rad)
+
+    def settle(self, before_s: float) -> None:
+        """Forget which states before a time are known: none of them will come again."""
+        self.track()
+        self._states = {q: state for q, state in self._states.items() if q >= 4.0 * before_s}

@@ -1,0 +1,259 @@
+"""The old part of the pose graph made coarse, so that its size hardly grows with the mission.
+
+Beyond the window of detail a chain keeps one node a piece. What lies between is frozen in the shape
+that it was last estimated in, and moves with the nodes around it; dead reckoning, ranges and
+closures of a piece are composed. A piece keeps its closures with the oldest pieces, which the start
+holds best: so the past hangs on a fixed map rather than on all of itself.
+"""
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware.geometry import Array
+from firmware.leader.chains import Chain
+from firmware.leader.ledger import (
+    AbsoluteRecord,
+    Anchor,
+    ClosureRecord,
+    Entry,
+    OdometryRecord,
+    PriorRecord,
+    RangeRecord,
+    Record,
+    SharedDriftRecord,
+    SharedWalkRecord,
+)
+from protocol.settings import Settings, setting
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CompositionSettings(Settings):
+    """How coarse the past becomes, and when."""
+
+    interval_s: float = setting(600.0, "s", "then the solver is built anew, too", minimum=20.0)
+    detail_s: float = setting(
+        1200.0, "s", "of full detail; longer than a follower keeps a frame", minimum=900.0
+    )
+    piece_s: float = setting(
+        60.0, "s", "between nodes beyond it: somewhat longer than a sub-map", minimum=10.0
+    )
+    distant_s: float = setting(4 * 3600.0, "s", "beyond it pieces are longer", minimum=1200.0)
+    distant_piece_s: float = setting(240.0, "s", "between nodes of the distant past", minimum=10.0)
+    closures_per_piece: int = setting(
+        3, "closures", "with older pieces; more say the same again", minimum=1
+    )
+    reject_chi_square: float = setting(
+        16.0, "1", "four sigmas: an old closure beyond it is dropped", minimum=1.0
+    )
+    range_floor_m: float = setting(
+        1.0, "m", "of composed ranges: sound speed errs alike in all of them", minimum=0.0
+    )
+
+
+Link = TypeVar("Link", ClosureRecord, RangeRecord)
+Group = list[tuple[int, Entry, Link]]  # of one pair of pieces: number, entry as it was, as moved
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Coarse:
+    """What composing leaves: entries by number, and records that are new."""
+
+    kept: Mapping[int, Entry]
+    new: list[Record]
+
+
+def detail_from_s(now_s: float, settings: CompositionSettings) -> float:
+    """Return where the window of detail begins: at the begin of a piece."""
+    return float(np.floor((now_s - settings.detail_s) / settings.piece_s) * settings.piece_s)
+
+
+def kept_nodes(
+    chain: Chain, now_s: float, pinned: set[int], settings: CompositionSettings
+) -> NDArray[np.bool_]:
+    """Return which nodes (K,) of a chain stay: the first of each piece, and all in the detail."""
+    s, times_s = settings, np.asarray(chain.times_s)
+    detail_s = detail_from_s(now_s, s)
+    distant_s = np.floor((now_s - s.distant_s) / s.distant_piece_s) * s.distant_piece_s
+    piece_s = np.where(times_s < distant_s, s.distant_piece_s, s.piece_s)
+    begins = np.diff(np.floor(times_s / piece_s) * piece_s, prepend=-np.inf) > 0
+    kept = begins | (times_s >= detail_s) | np.isin(chain.keys, sorted(pinned))
+    kept[-1] = True
+    return np.asarray(kept)
+
+
+def pinned_keys(entries: Iterable[Entry]) -> set[int]:
+    """Return the keys of nodes that priors and shared drifts speak of."""
+    pinned: set[int] = set()
+    for entry in entries:
+        if isinstance(entry.record, PriorRecord):
+            pinned.add(entry.record.key)
+        elif isinstance(entry.record, SharedDriftRecord):
+            pinned |= {entry.record.origin, entry.record.target}
+    return pinned
+
+
+class Composition:
+    """One pass over a ledger.
+
+    owners maps each dropped node to the one it is added to, apart_m2 to the covariance (2, 2) of
+    the way between the two; old holds the keys of the nodes before the window of detail;
+    positions_m is the estimate (2,) of every node, dropped ones among them.
+    """
+
+    def __init__(
+        self,
+        owners: Mapping[int, int],
+        apart_m2: Mapping[int, Array],
+        old: set[int],
+        positions_m: Mapping[int, Array],
+        settings: CompositionSettings,
+    ) -> None:
+        self._owners, self._apart_m2, self._old = owners, apart_m2, old
+        self._positions_m, self._settings = positions_m, settings
+
+    def coarse(self, ledger: Mapping[int, Entry]) -> Coarse:
+        """Return what stays of a ledger, in order; dead reckoning of dropped nodes is left out."""
+        kept: dict[int, Entry] = {}
+        closures: dict[tuple[int, int], Group[ClosureRecord]] = defaultdict(list)
+        ranges: dict[tuple[int, int], Group[RangeRecord]] = defaultdict(list)
+        for number, entry in ledger.items():
+            match entry.record:
+                case ClosureRecord() as closure:
+                    moved = self._moved(closure)
+                    if self._is_old(moved):
+                        closures[moved.origin.key, moved.target.key].append((number, entry, moved))
+                        continue
+                    kept[number] = Entry(record=moved, active=entry.active)
+                case RangeRecord() as ranging:
+                    near = self._moved(ranging)
+                    if self._is_old(near):
+                        ranges[near.origin.key, near.target.key].append((number, entry, near))
+                        continue
+                    kept[number] = Entry(record=near, active=entry.active)
+                case AbsoluteRecord(anchor=anchor) as fix:
+                    record = replace(fix, anchor=self._anchored(anchor))
+                    if anchor.key in self._owners:
+                        spread_m2 = fix.covariance_m2 + self._apart_m2[anchor.key]
+                        record = replace(record, covariance_m2=spread_m2)
+                    kept[number] = Entry(record=record, active=entry.active)
+                case record if self._owners.keys().isdisjoint(_nodes_of(record)):
+                    kept[number] = Entry(record=record, active=entry.active)
+        new: list[Record] = []
+        for range_group in ranges.values():
+            _keep(range_group, self._one_range, kept, new)
+        for closure_group in self._thinned(closures):
+            _keep(closure_group, self._one_closure, kept, new)
+        return Coarse(kept=dict(sorted(kept.items())), new=new)
+
+    def _anchored(self, anchor: Anchor) -> Anchor:
+        owner = self._owners.get(anchor.key)
+        if owner is None:
+            return anchor
+        shift_m = self._positions_m[anchor.key] - self._positions_m[owner]
+        return replace(anchor, key=owner, offset_m=anchor.offset_m + shift_m)
+
+    def _moved(self, record: Link) -> Link:
+        """Return a record between nodes that stay, as uncertain as the ways to them make it.
+
+        The closures of a piece share those ways: each has to count them as often as there are some.
+        """
+        ends = record.origin, record.target
+        apart_m2 = [self._apart_m2[end.key] for end in ends if end.key in self._owners]
+        if not apart_m2:
+            return record
+        spread_m2 = self._settings.closures_per_piece * np.sum(apart_m2, axis=0)
+        moved = replace(record, origin=self._anchored(ends[0]), target=self._anchored(ends[1]))
+        if isinstance(moved, ClosureRecord):
+            return replace(moved, covariance_m2=moved.covariance_m2 + spread_m2)
+        _, direction = moved.innovation_m(*self._ends_m(moved))
+        variance_m2 = moved.sigma_m**2 + float(direction @ spread_m2 @ direction)
+        return replace(moved, sigma_m=float(np.sqrt(variance_m2)))
+
+    def _is_old(self, record: ClosureRecord | RangeRecord) -> bool:
+        return record.origin.key in self._old and record.target.key in self._old
+
+    def _ends_m(self, record: ClosureRecord | RangeRecord) -> tuple[Array, Array]:
+        return self._positions_m[record.origin.key], self._positions_m[record.target.key]
+
+    def _thinned(
+        self, closures: Mapping[tuple[int, int], Group[ClosureRecord]]
+    ) -> list[Group[ClosureRecord]]:
+        """Return the groups that stay: of each piece those with the oldest others."""
+        by_piece: dict[int, list[tuple[float, Group[ClosureRecord]]]] = defaultdict(list)
+        for (origin, target), group in closures.items():
+            believed = [item for item in group if item[1].active and self._is_true(item[2])]
+            if origin == target or not believed:
+                continue
+            ends = sorted(
+                (anchor.time_s, anchor.key)
+                for anchor in (believed[0][2].origin, believed[0][2].target)
+            )
+            by_piece[ends[1][1]].append((ends[0][0], believed))
+        return [
+            group
+            for groups in by_piece.values()
+            for _, group in sorted(groups, key=lambda item: item[0])[
+                : self._settings.closures_per_piece
+            ]
+        ]
+
+    def _is_true(self, record: ClosureRecord) -> bool:
+        innovation_m = record.innovation_m(*self._ends_m(record))
+        chi_square = innovation_m @ np.linalg.solve(record.covariance_m2, innovation_m)
+        return bool(chi_square <= self._settings.reject_chi_square)
+
+    def _one_closure(self, records: list[ClosureRecord]) -> ClosureRecord:
+        """Return their weighted mean, as uncertain as one of them: neighbours err alike."""
+        weights = [np.linalg.inv(record.covariance_m2) for record in records]
+        covariance_m2 = np.linalg.inv(np.sum(weights, axis=0))
+        innovations_m = [record.innovation_m(*self._ends_m(record)) for record in records]
+        mean_m = covariance_m2 @ np.sum(
+            [w @ i for w, i in zip(weights, innovations_m, strict=True)], axis=0
+        )
+        return replace(
+            records[0],
+            offset_m=records[0].offset_m + innovations_m[0] - mean_m,
+            covariance_m2=len(records) * covariance_m2,
+        )
+
+    def _one_range(self, records: list[RangeRecord]) -> RangeRecord:
+        """Return the one in the middle with the mean of all innovations."""
+        middle = records[len(records) // 2]
+        innovations_m = [record.innovation_m(*self._ends_m(record))[0] for record in records]
+        own_m = middle.innovation_m(*self._ends_m(middle))[0]
+        sigma_m = float(np.sqrt(np.sum([r.sigma_m**2 for r in records])) / len(records))
+        return replace(
+            middle,
+            range_m=middle.range_m + own_m - float(np.mean(innovations_m)),
+            sigma_m=max(sigma_m, min(self._settings.range_floor_m, middle.sigma_m)),
+        )
+
+
+def _keep(
+    group: Group[Link],
+    composed: Callable[[list[Link]], Link],
+    kept: dict[int, Entry],
+    new: list[Record],
+) -> None:
+    """Let one record of a pair of pieces stay as it is; several become a new one."""
+    active = [item for item in group if item[1].active]
+    if len(active) == 1:
+        number, _, record = active[0]
+        kept[number] = Entry(record=record, active=True)
+    elif active:
+        new.append(composed([record for _, _, record in active]))
+
+
+def _nodes_of(record: Record) -> tuple[int, ...]:
+    match record:
+        case OdometryRecord():
+            return record.origin, record.target
+        case SharedWalkRecord():
+            return *record.origins, *record.targets
+        case _:
+            return ()

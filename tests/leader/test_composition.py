@@ -1,0 +1,182 @@
+"""A past made coarse: the estimate stays, the graph stays small, a copy goes on the same."""
+
+import dataclasses
+import pickle
+
+import numpy as np
+import pytest
+
+from firmware.geometry import Array
+from firmware.leader.composition import CompositionSettings
+from firmware.leader.ledger import ClosureRecord, OdometryRecord, RangeRecord, SharedWalkRecord
+from firmware.leader.pose_graph import GraphSettings, PoseGraph
+from firmware.submaps import Track
+
+HOURS, LAP_S = 1.5, 400
+SETTINGS = CompositionSettings()
+
+
+def sailed(rng: np.random.Generator, seconds: int, side_m: float) -> tuple[Track, Array]:
+    """Return drifting dead reckoning around a square, a lap in LAP_S, and the true way (T, 2)."""
+    time_s = np.arange(seconds + 1.0)
+    angle = 2 * np.pi * time_s / LAP_S
+    true_m = 100.0 * np.column_stack([np.cos(angle), np.sin(angle)]) + side_m
+    drift_m = np.cumsum(np.array([0.1, 0.05]) + 0.2 * rng.standard_normal((seconds + 1, 2)), axis=0)
+    north_m, east_m = (true_m + drift_m - drift_m[0]).T
+    return Track(time_s=time_s, north_m=north_m, east_m=east_m, yaw_rad=angle), true_m
+
+
+def until(track: Track, end_s: float) -> Track:
+    rows = track.time_s <= end_s
+    return Track(**{f.name: getattr(track, f.name)[rows] for f in dataclasses.fields(Track)})
+
+
+class Voyage:
+    """Two vehicles on laps, a closure with the lap before and a range every minute."""
+
+    def __init__(
+        self, settings: CompositionSettings | None, seconds: int = int(3600 * HOURS)
+    ) -> None:
+        self.rng, self.settings = np.random.default_rng(3), settings
+        self.tracks = [sailed(self.rng, seconds, side_m) for side_m in (0.0, 30.0)]
+        self.graph = PoseGraph(GraphSettings())
+        for vehicle, (track, true_m) in enumerate(self.tracks):
+            start_m = np.array([track.north_m[0], track.east_m[0]])
+            self.graph.add_vehicle(vehicle, 0.0, start_m, true_m[0])
+        self.nodes: list[int] = []
+        self.records: list[int] = []
+
+    def run(self, begin_s: int, end_s: int) -> "Voyage":
+        """Sail on by minutes; compose as often as a leader does."""
+        for now_s in range(begin_s + 60, end_s + 1, 60):
+            for vehicle, (track, _) in enumerate(self.tracks):
+                self.graph.extend(vehicle, until(track, now_s))
+            self._close(now_s)
+            self.graph.update()
+            if self.settings is not None and now_s % 600 == 0:
+                self.graph.compose(now_s, self.settings)
+                self.nodes.append(self.graph.nodes)
+                self.records.append(self.graph.records)
+        return self
+
+    def misses_m(self, vehicle: int) -> Array:
+        """Return the error (T,) of the whole estimate."""
+        track, true_m = self.tracks[vehicle]
+        reckoned_m = np.column_stack([track.north_m, track.east_m])
+        estimate_m = self.graph.trajectory(vehicle).correct(track.time_s, reckoned_m)
+        return np.asarray(np.hypot(*(estimate_m - true_m).T))
+
+    def _close(self, now_s: int) -> None:
+        (own, own_m), (other, other_m) = self.tracks
+        at = [
+            self.graph.anchor(0, float(now_s), own),
+            self.graph.anchor(1, float(now_s), other),
+        ]
+        range_m = float(np.hypot(*(other_m[now_s] - own_m[now_s])))
+        self.graph.add_range(at[0], at[1], range_m + self.rng.standard_normal())
+        for lap in (1, 2, 5):
+            then_s = now_s - lap * LAP_S
+            if then_s < 0:
+                continue
+            for vehicle, (track, true_m) in enumerate(self.tracks):
+                there = self.graph.anchor(vehicle, float(then_s), track)
+                offset_m = true_m[now_s] - true_m[then_s] + 0.5 * self.rng.standard_normal(2)
+                self.graph.add_closure(there, at[vehicle], offset_m, 0.25 * np.eye(2), active=True)
+
+
+@pytest.fixture(scope="module")
+def whole() -> Voyage:
+    return Voyage(None).run(0, int(3600 * HOURS))
+
+
+@pytest.fixture(scope="module")
+def coarse() -> Voyage:
+    return Voyage(SETTINGS).run(0, int(3600 * HOURS))
+
+
+def test_coarse_past_costs_little_accuracy(whole: Voyage, coarse: Voyage) -> None:
+    for vehicle in (0, 1):
+        assert coarse.misses_m(vehicle).mean() < 1.25 * whole.misses_m(vehicle).mean()
+
+
+def test_coarse_past_keeps_one_node_a_piece(whole: Voyage, coarse: Voyage) -> None:
+    hours = HOURS - SETTINGS.detail_s / 3600.0
+    pieces = 2 * hours * 3600.0 / SETTINGS.piece_s
+    detail = 2 * SETTINGS.detail_s / 10.0
+    assert coarse.graph.nodes < 1.1 * (pieces + detail) < 0.45 * whole.graph.nodes
+    assert coarse.graph.records < 0.6 * whole.graph.records
+
+
+def test_covariance_stays_honest(whole: Voyage, coarse: Voyage) -> None:
+    """The sigma of the newest position, where only one lap in three of closures hits a node."""
+    sigmas_m = [
+        np.sqrt(np.trace(v.graph.predicted_covariance(0, 3600 * HOURS))) for v in (whole, coarse)
+    ]
+    assert 0.8 * sigmas_m[0] < sigmas_m[1] < 1.6 * sigmas_m[0]
+
+
+def test_composing_moves_nothing_at_that_moment() -> None:
+    voyage = Voyage(None).run(0, 3600)
+    voyage.graph.solve_batch()
+    before_m = [voyage.graph.trajectory(v).position_m for v in (0, 1)]
+    voyage.graph.compose(3600.0, SETTINGS)
+    for vehicle in (0, 1):
+        after_m = voyage.graph.trajectory(vehicle).position_m
+        assert len(after_m) == len(before_m[vehicle])
+        assert np.hypot(*(after_m - before_m[vehicle]).T).max() < 0.8
+
+
+def test_incremental_and_batch_agree_on_a_coarse_past(coarse: Voyage) -> None:
+    graph = pickle.loads(pickle.dumps(_composed(coarse)))
+    before_m = graph.trajectory(0).position_m
+    graph.solve_batch()
+    assert np.hypot(*(graph.trajectory(0).position_m - before_m).T).max() < 0.05
+
+
+def test_copy_goes_on_exactly_as_its_original() -> None:
+    voyage = Voyage(SETTINGS).run(0, 3000)
+    copied = Voyage(SETTINGS)
+    copied.graph = pickle.loads(pickle.dumps(voyage.graph))
+    voyage.rng, copied.rng = np.random.default_rng(9), np.random.default_rng(9)
+    for each in (voyage, copied):
+        each.run(3000, 4200)
+    for vehicle in (0, 1):
+        ours, theirs = (v.graph.trajectory(vehicle).position_m for v in (voyage, copied))
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_graph_with_news_is_not_written_down() -> None:
+    voyage = Voyage(SETTINGS).run(0, 600)
+    voyage.graph.extend(0, until(voyage.tracks[0][0], 700.0))
+    with pytest.raises(TypeError, match="news"):
+        pickle.dumps(voyage.graph)
+
+
+def test_closure_beyond_its_sigmas_is_not_taken_along() -> None:
+    voyage = Voyage(None).run(0, 3600)
+    track, true_m = voyage.tracks[0]
+    then, now = (voyage.graph.anchor(0, t, track) for t in (500.0, 1100.0))
+    wrong_m = true_m[1100] - true_m[500] + 20.0
+    number = voyage.graph.add_closure(then, now, wrong_m, np.eye(2), active=True)
+    voyage.graph.update()
+    voyage.graph.compose(3600.0, SETTINGS)
+    assert number not in voyage.graph
+    left = voyage.graph._records(ClosureRecord)
+    state = voyage.graph._state
+    misses_m = [r.innovation_m(state(r.origin.key)[:2], state(r.target.key)[:2]) for r in left]
+    assert np.hypot(*np.array(misses_m).T).max() < 8.0
+
+
+def test_every_kept_node_is_tied_to_the_one_before(coarse: Voyage) -> None:
+    graph = coarse.graph
+    for chain in graph._chains.values():
+        steps = {(r.origin, r.target) for r in graph._records(OdometryRecord)}
+        assert all(pair in steps for pair in zip(chain.keys, chain.keys[1:], strict=False))
+    walks = graph._records(SharedWalkRecord)
+    assert len(walks) > 0.8 * 3600 * HOURS / SETTINGS.piece_s
+    assert 0 < len(graph._records(RangeRecord)) <= 3600 * HOURS / 60
+
+
+def _composed(voyage: Voyage) -> PoseGraph:
+    voyage.graph.compose(3600 * HOURS, SETTINGS)
+    return voyage.graph

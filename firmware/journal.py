@@ -24,7 +24,7 @@ from protocol.errors import ConfigError, FathomError
 from protocol.settings import Settings, setting
 
 LOG = logging.getLogger(__name__)
-SCHEMA = "1"
+SCHEMA = "2"
 BOOT_EPOCHS = 16  # the header has 4 bits for it
 REPLAYS_TRIED = 5
 """A store whose replay ended the process so often is set aside: something in it is deadly."""
@@ -34,6 +34,7 @@ CREATE TABLE about (name TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE inputs (number INTEGER PRIMARY KEY, checksum INTEGER NOT NULL, body BLOB NOT NULL);
 CREATE TABLE checkpoint (one INTEGER PRIMARY KEY CHECK (one = 1), after INTEGER NOT NULL,
                          checksum INTEGER NOT NULL, body BLOB NOT NULL);
+CREATE TABLE shelf (name TEXT PRIMARY KEY, body BLOB NOT NULL)
 """
 _LENGTH_BYTES = 4
 
@@ -140,6 +141,20 @@ class Journal:
         """Return the newest checkpoint, or None."""
         row = self._one("SELECT body FROM checkpoint")
         return None if row is None else zlib.decompress(row[0])
+
+    def put(self, name: str, body: bytes) -> None:
+        """Put away what is wanted seldom; a disk that does not take it loses it, counted."""
+        try:
+            if self._connection is None:
+                raise sqlite3.OperationalError("no store")
+            self._connection.execute("REPLACE INTO shelf VALUES (?, ?)", (name, body))
+        except sqlite3.Error:
+            self.counters["store_shelf_lost"] += 1
+
+    def get(self, name: str) -> bytes | None:
+        """Return what was put away under a name, or None."""
+        row = self._one("SELECT body FROM shelf WHERE name = ?", name)
+        return None if row is None else bytes(row[0])
 
     def replay(self) -> Iterator[tuple[int, bytes]]:
         """Yield kind and body of every input since the checkpoint, in order.

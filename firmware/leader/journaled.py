@@ -1,6 +1,8 @@
 """A leader that survives a kill: inputs and what matches found go to a journal.
 
 Matching is not done again in a replay: the outcomes are inputs, in the order in which they came.
+Whenever the graph was composed, the core itself is written down and only what comes later is
+replayed; ISAM2, which is not written, has just been built from the ledger, and is so built again.
 """
 
 import contextlib
@@ -14,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from firmware.belief import Belief
+from firmware.checkpoints import NotNowError, read, written
 from firmware.dead_reckoning import ReckonedState
 from firmware.inputs import Heard, Kind, from_state, to_instant, to_state
 from firmware.journal import Journal, StoreUnusableError
@@ -25,6 +28,7 @@ from firmware.soundings import Odometry, Ping
 from protocol.schedule import Slots
 
 LOG = logging.getLogger(__name__)
+_RECORDER = "recorder"
 _NOW = struct.Struct("<d")
 
 
@@ -73,9 +77,12 @@ class JournaledLeader(LeaderCore):
             super().receive_frame(frame, toa_s, now_s)
 
     def tick(self, now_s: float) -> None:
-        """Record and work."""
+        """Record and work; write the core down when its graph was composed."""
         if self.recorder.tick(now_s):
+            before_s = self.composed_s
             super().tick(now_s)
+            if self.composed_s != before_s:
+                self._checkpoint()
 
     def next_jobs(self) -> SheetJobs | None:
         """Return the matches that wait; first those that a kill has cut short."""
@@ -114,7 +121,7 @@ class JournaledLeader(LeaderCore):
         settings, slots = self._made_with
         journal = self.recorder.journal
         kept = to_state(journal.start(from_state(start)))
-        super().__init__(journal.boot_epoch, kept, settings=settings, slots=slots)
+        super().__init__(journal.boot_epoch, kept, settings=settings, slots=slots, shelf=journal)
 
     @contextlib.contextmanager
     def _within(self) -> Iterator[None]:
@@ -125,7 +132,21 @@ class JournaledLeader(LeaderCore):
         finally:
             self._is_within = False
 
+    def _checkpoint(self) -> None:
+        journal = self.recorder.journal
+        state = {name: value for name, value in self.__dict__.items() if name != _RECORDER}
+        try:
+            journal.checkpoint(written(state, self.recorder.marks()))
+        except NotNowError:
+            journal.counters["store_checkpoints_put_off"] += 1
+
     def _resume(self) -> None:
+        body = self.recorder.journal.checkpointed()
+        if body is not None:
+            state, marks = read(body)
+            self.__dict__.update(state)
+            self.atlas.shelf = self.recorder.journal
+            self.recorder.restore(marks)
         for kind, body in self.recorder.journal.replay():
             try:
                 with self._within():

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from firmware.follower.journaled import JournaledFollower
-from firmware.inputs import fan_of, from_ping, to_ping
+from firmware.inputs import fan_of, from_ping, to_odometry, to_ping
 from firmware.journal import Journal, JournalSettings, Owner
 from firmware.leader.journaled import JournaledLeader, from_outcomes, to_outcomes
 from firmware.leader.matches import Hint, Match, MatchOutcome, NoMatch
@@ -20,7 +20,13 @@ from host_tools.simulator.vehicle import SimulatedVehicle
 from protocol.acoustics import Delivery
 from protocol.schedule import Slots
 
-SHORT = {"duration_min": 2.2, "follower_duration_min": 2.0, "leg_m": 60.0, "beams": 32}
+SHORT = {
+    "duration_min": 2.2,
+    "follower_duration_min": 2.0,
+    "leg_m": 60.0,
+    "beams": 32,
+    "leader.composition.interval_s": 30.0,
+}
 KILLS = 8
 
 
@@ -114,10 +120,16 @@ def test_nothing_is_sent_while_catching_up_nor_told_differently(killed: Told) ->
         assert node.differing == 0
 
 
-def test_follower_writes_itself_down_so_that_its_store_stays_small(undisturbed: Told) -> None:
-    journal = undisturbed.nodes[1].core.recorder.journal
+@pytest.mark.parametrize("vehicle", [0, 1])
+def test_vehicles_write_themselves_down_so_that_little_is_replayed(
+    undisturbed: Told, vehicle: int
+) -> None:
+    journal = undisturbed.nodes[vehicle].core.recorder.journal
     assert journal.counters["store_checkpoints"] >= 3
+    assert journal.counters["store_checkpoints_put_off"] == 0
     assert journal.counters["store_set_aside"] == 0
+    odometry_s = [to_odometry(body).time_s for kind, body in journal.replay() if kind == 1]
+    assert odometry_s[0] > 85.0
 
 
 def test_ping_reads_back_within_float32_and_then_exactly() -> None:

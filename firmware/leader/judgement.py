@@ -124,7 +124,7 @@ class Judgement:
             graph.set_active(number, active=fits)
 
     def forget(self, before_s: float, graph: PoseGraph) -> None:
-        """Wait no longer for closures found before a time, nor doubt hints that the graph let go."""
+        """Wait no longer for closures found before a time; drop hints that the graph let go."""
         self._hints = deque((n for n in self._hints if n in graph), self._settings.hints)
         waiting = [c for c in self._waiting if c.time_s >= before_s]
         self.counters["closures_given_up"] += len(self._waiting) - len(waiting)

@@ -11,7 +11,7 @@ import numpy as np
 from scipy import ndimage
 
 from firmware.geometry import Array
-from firmware.leader.screening import Layer, land, sample
+from firmware.leader.screening import Landing, Layer, land, sample
 
 _DEPTH, _VARIANCE, _TIME, _SLOPES = 0, 1, 2, slice(3, 5)  # of the fields
 _LEAST_CELLS = 12  # fewer cells than unknowns determine nothing
@@ -48,6 +48,7 @@ class Aligned:
 
     shift_m: Array
     cell_m: float
+    centre_m: Array  # (2,) of the overlap, in the reference's coordinates
     both: Array
     difference_m: Array
     weight: Array
@@ -103,6 +104,7 @@ def align(
     return Aligned(
         shift_m=shift_m,
         cell_m=query.grid.cell_m,
+        centre_m=_centre(clean, query, at) + shift_m,
         both=clean,
         difference_m=under[_DEPTH] - over[_DEPTH],
         weight=clean / variance,
@@ -112,6 +114,15 @@ def align(
         basis=_polynomials(clean, query.grid.cell_m),
         spans=(ages[0], ages[1]),
     )
+
+
+def _centre(both: Array, query: Layer, at: Landing) -> Array:
+    """Return the middle (2,) of the overlap in the query's coordinates."""
+    cells = both.sum()
+    row = at.query[0].start + both.sum(axis=1) @ np.arange(both.shape[0]) / cells
+    column = at.query[1].start + both.sum(axis=0) @ np.arange(both.shape[1]) / cells
+    origin_m = np.array([query.grid.north0_m, query.grid.east0_m])
+    return np.asarray(origin_m + query.grid.cell_m * np.array([row, column]))
 
 
 def _age(time_s: Array, both: Array, origin_s: float | None) -> Span:

@@ -1,5 +1,6 @@
 """Loop closures: which pairs of sub-maps to match, and what becomes of what the match finds."""
 
+import dataclasses
 import enum
 from dataclasses import dataclass
 
@@ -158,12 +159,13 @@ def closure_of(
         return None
     found = outcome.match
     ends_m, anchors = [], []
-    for sheet, drift_mps, time_s in (
-        (job.origin, job.origin_drift_mps, found.reference_time_s),
-        (job.target, job.target_drift_mps, found.query_time_s),
+    for sheet, drift_mps, time_s, centre_m in (
+        (job.origin, job.origin_drift_mps, found.reference_time_s, found.centre_m),
+        (job.target, job.target_drift_mps, found.query_time_s, found.centre_m - found.shift_m),
     ):
         ends_m.append(sheet.reckoned_at(time_s) - drift_mps * (time_s - sheet.time_s))
-        anchors.append(graph.anchor(sheet.id.chain, time_s, sheet.track))
+        anchor = graph.anchor(sheet.id.chain, time_s, sheet.track)
+        anchors.append(dataclasses.replace(anchor, lever_m=centre_m - ends_m[-1]))
     return Closure(
         time_s=now_s,
         origin=job.origin.id,
@@ -216,7 +218,7 @@ def gated(closures: list[Closure], graph: PoseGraph, settings: ClosureSettings) 
         ends = slice(4 * k, 4 * k + 4)
         prior_m2 = between @ joint_m2[ends, ends] @ between.T
         spread_m2 = prior_m2 + closure.covariance_m2
-        predicted_m = graph.position(closure.target_anchor) - graph.position(closure.origin_anchor)
+        predicted_m = graph.offset(closure.origin_anchor, closure.target_anchor)
         innovation_m = closure.offset_m - predicted_m
         if innovation_m @ np.linalg.solve(spread_m2, innovation_m) > settings.gate_chi_square:
             continue

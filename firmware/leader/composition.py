@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from firmware.geometry import Array
 from firmware.leader.chains import Chain
 from firmware.leader.ledger import (
+    QUARTER_TURN,
     AbsoluteRecord,
     Anchor,
     ClosureRecord,
@@ -101,8 +102,8 @@ class Composition:
     """One pass over a ledger.
 
     owners maps each dropped node to the one it is added to, apart_m2 to the covariance (2, 2) of
-    the way between the two; old holds the keys of the nodes before the window of detail;
-    positions_m is the estimate (2,) of every node, dropped ones among them.
+    the way between the two; old holds the keys of the nodes before the window of detail; estimate
+    has the position (2,) of every node, dropped ones among them, and every vehicle's parameters.
     """
 
     def __init__(
@@ -110,11 +111,11 @@ class Composition:
         owners: Mapping[int, int],
         apart_m2: Mapping[int, Array],
         old: set[int],
-        positions_m: Mapping[int, Array],
+        estimate: Mapping[int, Array],
         settings: CompositionSettings,
     ) -> None:
         self._owners, self._apart_m2, self._old = owners, apart_m2, old
-        self._positions_m, self._settings = positions_m, settings
+        self._estimate, self._settings = estimate, settings
 
     def coarse(self, ledger: Mapping[int, Entry]) -> Coarse:
         """Return what stays of a ledger, in order; dead reckoning of dropped nodes is left out."""
@@ -150,11 +151,15 @@ class Composition:
             _keep(closure_group, self._one_closure, kept, new)
         return Coarse(kept=dict(sorted(kept.items())), new=new)
 
-    def _anchored(self, anchor: Anchor) -> Anchor:
+    def _anchored(self, anchor: Anchor, *, as_reckoned: bool = False) -> Anchor:
+        """Return an anchor at a node that stays; the way there estimated, or as it was reckoned."""
         owner = self._owners.get(anchor.key)
         if owner is None:
             return anchor
-        shift_m = self._positions_m[anchor.key] - self._positions_m[owner]
+        shift_m = self._estimate[anchor.key] - self._estimate[owner]
+        if as_reckoned:
+            heading_rad, scale = self._estimate[anchor.parameters]
+            shift_m = shift_m + heading_rad * QUARTER_TURN @ shift_m + scale * shift_m
         return replace(anchor, key=owner, offset_m=anchor.offset_m + shift_m)
 
     def _moved(self, record: Link) -> Link:
@@ -167,7 +172,9 @@ class Composition:
         if not apart_m2:
             return record
         spread_m2 = self._settings.closures_per_piece * np.sum(apart_m2, axis=0)
-        moved = replace(record, origin=self._anchored(ends[0]), target=self._anchored(ends[1]))
+        as_reckoned = isinstance(record, ClosureRecord)
+        origin, target = (self._anchored(end, as_reckoned=as_reckoned) for end in ends)
+        moved = replace(record, origin=origin, target=target)
         if isinstance(moved, ClosureRecord):
             return replace(moved, covariance_m2=moved.covariance_m2 + spread_m2)
         _, direction = moved.innovation_m(*self._ends_m(moved))
@@ -178,7 +185,13 @@ class Composition:
         return record.origin.key in self._old and record.target.key in self._old
 
     def _ends_m(self, record: ClosureRecord | RangeRecord) -> tuple[Array, Array]:
-        return self._positions_m[record.origin.key], self._positions_m[record.target.key]
+        return self._estimate[record.origin.key], self._estimate[record.target.key]
+
+    def _innovation_m(self, record: ClosureRecord) -> Array:
+        ends = record.origin, record.target
+        return record.innovation_m(
+            *self._ends_m(record), tuple(self._estimate[end.parameters] for end in ends)
+        )
 
     def _thinned(
         self, closures: Mapping[tuple[int, int], Group[ClosureRecord]]
@@ -203,7 +216,7 @@ class Composition:
         ]
 
     def _is_true(self, record: ClosureRecord) -> bool:
-        innovation_m = record.innovation_m(*self._ends_m(record))
+        innovation_m = self._innovation_m(record)
         chi_square = innovation_m @ np.linalg.solve(record.covariance_m2, innovation_m)
         return bool(chi_square <= self._settings.reject_chi_square)
 
@@ -211,7 +224,7 @@ class Composition:
         """Return their weighted mean, as uncertain as one of them: neighbours err alike."""
         weights = [np.linalg.inv(record.covariance_m2) for record in records]
         covariance_m2 = np.linalg.inv(np.sum(weights, axis=0))
-        innovations_m = [record.innovation_m(*self._ends_m(record)) for record in records]
+        innovations_m = [self._innovation_m(record) for record in records]
         mean_m = covariance_m2 @ np.sum(
             [w @ i for w, i in zip(weights, innovations_m, strict=True)], axis=0
         )

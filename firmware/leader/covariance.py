@@ -18,6 +18,7 @@ class Refined:
     walk_m2 is to be added to each axis for the random walk of dead reckoning between the
     overlap and the two reference times. variance_m2 is the predicted mean variance of a
     cell's difference; misfit the mean of squared normalised residuals (1 when the model holds).
+    centre_m (2,) is the overlap's middle on the reference.
     """
 
     shift_m: Array
@@ -27,6 +28,7 @@ class Refined:
     variance_m2: float
     misfit: float
     overlap_cells: int
+    centre_m: Array
     reference_time_s: float
     query_time_s: float
 
@@ -49,6 +51,7 @@ def measure(field: Aligned, noise: NoiseModel) -> Refined:
         variance_m2=float(np.sum(field.variance_m2 * field.both) / cells),
         misfit=misfit,
         overlap_cells=int(cells),
+        centre_m=field.centre_m,
         reference_time_s=field.spans[0].origin_s,
         query_time_s=field.spans[1].origin_s,
     )

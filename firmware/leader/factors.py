@@ -7,6 +7,7 @@ import numpy as np
 
 from firmware.geometry import Array
 from firmware.leader.ledger import (
+    QUARTER_TURN,
     AbsoluteRecord,
     ClosureRecord,
     OdometryRecord,
@@ -17,10 +18,8 @@ from firmware.leader.ledger import (
     SharedWalkRecord,
 )
 
-_QUARTER_TURN = np.array([[0.0, -1.0], [1.0, 0.0]])
 _POSITION = np.eye(2, 4)  # takes a node's state to its position
 _BIAS = np.eye(2, 4, 2)  # and this to its bias
-_NOTHING_SAID = 1e8  # (m/s)^2: ten kilometres a second of bias is no statement
 _Jacobians = list[Array] | None
 
 
@@ -39,7 +38,7 @@ def factor_of(  # noqa: PLR0911
         case SharedWalkRecord():
             return _shared_walk(record)
         case ClosureRecord():
-            return _closure(record, robust_kernel)
+            return _closure(record, _robust(record.covariance_m2, robust_kernel))
         case RangeRecord():
             return _range(record, _robust(np.array([[record.sigma_m**2]]), robust_kernel))
         case AbsoluteRecord():
@@ -58,7 +57,7 @@ def _odometry(record: OdometryRecord) -> gtsam.NonlinearFactor:
     from_origin = -np.eye(4)
     from_origin[:2, 2:] = record.interval_s * np.eye(2)
     from_parameters = np.zeros((4, 2))
-    from_parameters[:2, 0] = _QUARTER_TURN @ record.moved_m
+    from_parameters[:2, 0] = QUARTER_TURN @ record.moved_m
     from_parameters[:2, 1] = record.moved_m
     right = np.concatenate([record.moved_m, np.zeros(2)])
     sigmas = np.repeat([record.position_sigma_m, record.bias_sigma_mps], 2)
@@ -110,17 +109,26 @@ def _custom(
     return gtsam.CustomFactor(noise, keys, error)
 
 
-def _closure(record: ClosureRecord, robust_kernel: float) -> gtsam.NonlinearFactor:
-    """Return a factor between whole states, whose biases it says nothing about.
+def _closure(record: ClosureRecord, noise: gtsam.noiseModel.Base) -> gtsam.NonlinearFactor:
+    """Return a factor of two nodes and of the parameters of one vehicle, or of two."""
+    origin, target = record.origin, record.target
+    turning = {origin.parameters: np.zeros((2, 2)), target.parameters: np.zeros((2, 2))}
+    turning[origin.parameters] += origin.turning
+    turning[target.parameters] -= target.turning
+    keys = [origin.key, target.key, *turning]
 
-    It stands for a factor between positions because gtsam evaluates it without calling Python.
-    """
-    between = np.zeros(4)
-    between[:2] = record.offset_m + record.origin.offset_m - record.target.offset_m
-    covariance = _NOTHING_SAID * np.eye(4)
-    covariance[:2, :2] = record.covariance_m2
-    noise = _robust(covariance, robust_kernel)
-    return gtsam.BetweenFactorVector(record.origin.key, record.target.key, between, noise)
+    def error(_this: object, values: gtsam.Values, jacobians: _Jacobians) -> Array:
+        if jacobians is not None:
+            jacobians[0], jacobians[1] = -_POSITION, _POSITION
+            for k, turned in enumerate(turning.values(), start=2):
+                jacobians[k] = turned
+        return record.innovation_m(
+            values.atVector(origin.key)[:2],
+            values.atVector(target.key)[:2],
+            (values.atVector(origin.parameters), values.atVector(target.parameters)),
+        )
+
+    return _custom(noise, keys, error)
 
 
 def _range(record: RangeRecord, noise: gtsam.noiseModel.Base) -> gtsam.NonlinearFactor:

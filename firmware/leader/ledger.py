@@ -4,20 +4,33 @@ Node states are (north, east, bias north, bias east); a vehicle's parameters are
 rad, log scale). Every record computes its own error, in the units of its sigmas.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from firmware.geometry import Array
 
+QUARTER_TURN = np.array([[0.0, -1.0], [1.0, 0.0]])
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Anchor:
-    """A node, and the offset by dead reckoning from it to the position that is meant."""
+    """A node, the offset by dead reckoning from it to the position that is meant, and a lever.
+
+    The lever leads from that position to a place that the sonar saw. Both are told in the frame of
+    the vehicle's own compass, and turn and stretch with its parameters.
+    """
 
     key: int
+    parameters: int
     offset_m: Array  # (2,)
     time_s: float
+    lever_m: Array = field(default_factory=lambda: np.zeros(2))  # (2,)
+
+    @property
+    def turning(self) -> Array:
+        """Return by how much the place moves back per radian and unit of the parameters, (2, 2)."""
+        return np.column_stack([QUARTER_TURN @ (self.offset_m + self.lever_m), self.offset_m])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,18 +82,23 @@ class SharedWalkRecord:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClosureRecord:
-    """A loop closure: position of target minus position of origin (2,), with its covariance."""
+    """A loop closure: position of target minus position of origin (2,), with its covariance.
+
+    It says that both saw the same place, each along its lever, whose difference the offset is.
+    """
 
     origin: Anchor
     target: Anchor
     offset_m: Array
     covariance_m2: Array  # (2, 2)
 
-    def innovation_m(self, origin_m: Array, target_m: Array) -> Array:
-        """Return estimated minus measured offset (2,) for node positions (2,)."""
-        return np.asarray(
-            target_m + self.target.offset_m - origin_m - self.origin.offset_m - self.offset_m
-        )
+    def innovation_m(
+        self, origin_m: Array, target_m: Array, parameters: tuple[Array, ...]
+    ) -> Array:
+        """Return estimated minus measured offset (2,) for the nodes' positions and parameters."""
+        origin = origin_m + self.origin.offset_m - self.origin.turning @ parameters[0]
+        target = target_m + self.target.offset_m - self.target.turning @ parameters[1]
+        return np.asarray(target - origin - self.offset_m)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

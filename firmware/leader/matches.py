@@ -110,7 +110,8 @@ class Match:
     mean times at which the overlap was measured. covariance_m2 (2, 2) is the measurement's own,
     without the prior. axis_deg is None, or the direction from north in which a one-axis closure
     holds; across it the covariance is wide. false_mass is the posterior probability that the true
-    shift lies outside the winner's basin (outside its line, for one axis).
+    shift lies outside the winner's basin (outside its line, for one axis). centre_m (2,) is the
+    overlap's middle in the reference's coordinates.
     """
 
     shift_m: Array
@@ -123,6 +124,7 @@ class Match:
     log_evidence: float
     misfit: float
     variance_m2: float
+    centre_m: Array
     reference_time_s: float
     query_time_s: float
 

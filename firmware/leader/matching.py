@@ -313,6 +313,7 @@ def _closure(
         log_evidence=log_evidence,
         misfit=refined.misfit,
         variance_m2=refined.variance_m2,
+        centre_m=refined.centre_m,
         reference_time_s=refined.reference_time_s,
         query_time_s=refined.query_time_s,
     )

@@ -212,7 +212,12 @@ class PoseGraph:
             )
         bias_mps = self._state(key)[2:]
         moved_m = track.position_at(time_s) - chain.reckoned_m[nearest]
-        return Anchor(key=key, offset_m=moved_m - bias_mps * lag_s, time_s=time_s)
+        return Anchor(
+            key=key,
+            parameters=chain.parameters,
+            offset_m=moved_m - bias_mps * lag_s,
+            time_s=time_s,
+        )
 
     def add_closure(
         self, origin: Anchor, target: Anchor, offset_m: Array, covariance_m2: Array, *, active: bool
@@ -301,8 +306,10 @@ class PoseGraph:
     def compose(self, now_s: float, settings: CompositionSettings) -> None:
         """Make the past coarse, and restart ISAM2 from the ledger and the estimate."""
         self.update()
-        positions_m = {
-            key: self._state(key)[:2] for chain in self._chains.values() for key in chain.keys
+        estimate = {
+            key: self._state(key)[:2]
+            for chain in self._chains.values()
+            for key in (*chain.keys, chain.parameters)
         }
         pinned, detail_s = pinned_keys(self._ledger.values()), detail_from_s(now_s, settings)
         owners: dict[int, int] = {}
@@ -316,7 +323,7 @@ class PoseGraph:
             for key, time_s in zip(chain.keys, chain.times_s, strict=True)
             if time_s < detail_s
         }
-        coarse = Composition(owners, apart_m2, old, positions_m, settings).coarse(self._ledger)
+        coarse = Composition(owners, apart_m2, old, estimate, settings).coarse(self._ledger)
         self._ledger = dict(coarse.kept)
         for record in coarse.new:
             self._enter(record)
@@ -353,20 +360,23 @@ class PoseGraph:
         """Return the estimated position (2,) of an anchor."""
         return self._state(anchor.key)[:2] + anchor.offset_m
 
+    def offset(self, origin: Anchor, target: Anchor) -> Array:
+        """Return what a closure between two anchors would measure by this estimate, (2,)."""
+        places_m = [
+            self.position(end) - end.turning @ self._state(end.parameters)
+            for end in (origin, target)
+        ]
+        return np.asarray(places_m[1] - places_m[0])
+
     def covariance(self, anchors: list[Anchor]) -> Array:
         """Return the joint covariance (2A, 2A) in m^2 of the positions of A anchors.
 
         Raises EstimationError if the information matrix is singular.
         """
-        self.update()
         keys = list(dict.fromkeys(anchor.key for anchor in anchors))
-        try:
-            joint_m2 = self._isam.jointMarginalCovariance(keys).fullMatrix()
-        except RuntimeError as error:
-            raise EstimationError("the information matrix is singular") from error
-        first = dict(zip(keys, range(0, 4 * len(keys), 4), strict=True))
-        rows = [first[anchor.key] + axis for anchor in anchors for axis in (0, 1)]
-        return np.asarray(joint_m2[np.ix_(rows, rows)])
+        row = {key: 2 * k for k, key in enumerate(keys)}
+        rows = [row[anchor.key] + axis for anchor in anchors for axis in (0, 1)]
+        return np.asarray(self._joint_covariance(keys)[np.ix_(rows, rows)])
 
     def predicted_covariance(self, vehicle: int, time_s: float) -> Array:
         """Return the covariance (2, 2) in m^2 of a vehicle's position at or after its last node."""
@@ -383,9 +393,10 @@ class PoseGraph:
     def innovation(self, number: int) -> Array:
         """Return estimated minus measured offset (2,) of a closure, in metres."""
         record = self._closure(number)
-        return record.innovation_m(
-            self._state(record.origin.key)[:2], self._state(record.target.key)[:2]
-        )
+        ends = (record.origin, record.target)
+        origin_m, target_m = (self._state(end.key)[:2] for end in ends)
+        parameters = [self._state(end.parameters) for end in ends]
+        return record.innovation_m(origin_m, target_m, (parameters[0], parameters[1]))
 
     def chi_square(self, number: int) -> float:
         """Return the squared innovation of a closure in units of its covariance."""
@@ -427,11 +438,20 @@ class PoseGraph:
         for tie in shared_walk(first, chain, begin_s, end_s, apart):
             self._enter(tie)
 
+    def _joint_covariance(self, keys: list[int]) -> Array:
+        """Return the joint covariance (2K, 2K) in m^2 of the positions of K nodes."""
+        self.update()
+        try:
+            joint = self._isam.jointMarginalCovariance(keys).fullMatrix()
+        except RuntimeError as error:
+            raise EstimationError("the information matrix is singular") from error
+        rows = (4 * np.arange(len(keys))[:, None] + np.arange(2)).ravel()
+        return np.asarray(joint[np.ix_(rows, rows)])
+
     def _apart(self, owners: Mapping[int, int]) -> dict[int, Array]:
         """Return the covariance (2, 2) of the way between each node and its owner."""
         keys = list(dict.fromkeys([*owners, *owners.values()]))
-        anchors = [Anchor(key=key, offset_m=np.zeros(2), time_s=0.0) for key in keys]
-        joint_m2 = self.covariance(anchors) if keys else np.zeros((0, 0))
+        joint_m2 = self._joint_covariance(keys) if keys else np.zeros((0, 0))
         rows = {key: slice(2 * k, 2 * k + 2) for k, key in enumerate(keys)}
         apart_m2 = {}
         for key, owner in owners.items():
@@ -458,7 +478,8 @@ class PoseGraph:
 
     def _anchor_in_shape(self, vehicle: int, key: int, time_s: float, track: Track) -> Anchor:
         here_m = self.trajectory(vehicle).correct(time_s, track.position_at(time_s))
-        return Anchor(key=key, offset_m=here_m - self._state(key)[:2], time_s=time_s)
+        moved_m, parameters = here_m - self._state(key)[:2], self._chains[vehicle].parameters
+        return Anchor(key=key, parameters=parameters, offset_m=moved_m, time_s=time_s)
 
     def _enter(self, record: Record, *, active: bool = True) -> int:
         number, self._entered = self._entered, self._entered + 1

@@ -177,6 +177,7 @@ def test_outcomes_read_back_exactly() -> None:
         log_evidence=np.inf,
         misfit=1.0,
         variance_m2=2.0,
+        centre_m=np.array([5.0, 6.0]),
         reference_time_s=3.0,
         query_time_s=4.0,
     )

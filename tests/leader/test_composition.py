@@ -163,7 +163,14 @@ def test_closure_beyond_its_sigmas_is_not_taken_along() -> None:
     assert number not in voyage.graph
     left = voyage.graph._records(ClosureRecord)
     state = voyage.graph._state
-    misses_m = [r.innovation_m(state(r.origin.key)[:2], state(r.target.key)[:2]) for r in left]
+    misses_m = [
+        r.innovation_m(
+            state(r.origin.key)[:2],
+            state(r.target.key)[:2],
+            (state(r.origin.parameters), state(r.target.parameters)),
+        )
+        for r in left
+    ]
     assert np.hypot(*np.array(misses_m).T).max() < 8.0
 
 

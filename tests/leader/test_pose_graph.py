@@ -160,3 +160,36 @@ def test_current_that_turns_for_one_vehicle_turns_for_the_other() -> None:
         graph.update()
         misses_m.append(float(np.abs(graph.trajectory(1).position_m[-1, 0])))
     assert misses_m[0] < 0.5 * misses_m[1]
+
+
+def test_closures_between_lines_do_not_vouch_for_the_compass() -> None:
+    """A whole map may turn about its start: what the sonar saw beside the track turns with it."""
+    rng, turn_rad = np.random.default_rng(3), np.radians(0.5)
+    turned = np.array([[1.0, -turn_rad], [turn_rad, 1.0]])
+    times_s = np.arange(0.0, 1371.0)
+    line, age_s = np.divmod(times_s, 350.0)
+    along_m = np.minimum(2.0 * age_s, 600.0)
+    along_m = np.where(line % 2, 600.0 - along_m, along_m)
+    true_m = np.column_stack([along_m, 100.0 * line + 2.0 * np.maximum(age_s - 300.0, 0.0)])
+    reckoned_m = true_m @ turned.T
+    north_m, east_m = reckoned_m.T
+    track = Track(time_s=times_s, north_m=north_m, east_m=east_m, yaw_rad=0.0 * north_m)
+    graph = started(track)
+    for first_s in np.arange(10.0, 290.0, 20.0):
+        for before in range(3):
+            ends_s = [350.0 * before + first_s, 350.0 * before + 650.0 - first_s]
+            seen_m = true_m[[int(t) for t in ends_s]].mean(axis=0)
+            ends = [
+                dataclasses.replace(
+                    graph.anchor(0, t, track), lever_m=turned @ (seen_m - true_m[int(t)])
+                )
+                for t in ends_s
+            ]
+            offset_m = ends[0].lever_m - ends[1].lever_m + 0.5 * rng.standard_normal(2)
+            graph.add_closure(ends[0], ends[1], offset_m, 0.25 * np.eye(2), active=True)
+    graph.update()
+    far = graph.anchor(0, 1350.0, track)
+    away_m = float(np.hypot(*true_m[1350]))
+    sigma_m = float(np.sqrt(np.linalg.eigvalsh(graph.covariance([far]))[-1]))
+    assert sigma_m > 0.7 * np.radians(SETTINGS.heading_bias_sigma_deg) * away_m
+    assert np.hypot(*(graph.position(far) - true_m[1350])) < 3.0 * sigma_m

@@ -48,8 +48,23 @@ def status_lines(folder: Path) -> Iterator[str]:
         yield owner
         for group, line in _grouped(values).items():
             yield f"  {group:<11} {line}"
+        yield from (f"  {line}" for line in advice_lines(values))
     for path in stores:
         yield _store_line(path)
+
+
+def advice_lines(counters: Mapping[str, float]) -> Iterator[str]:
+    """Yield a line for each count that somebody has to act on."""
+    if counters.get("modem_own_echoes"):
+        yield "frames bear our own modem's address: give every modem its own ?address="
+    if counters.get("frames_with_our_number") or counters.get("modem_rejected_reflected"):
+        yield "frames bear our own vehicle's number: give every vehicle its own --vehicle"
+    if counters.get("rejected_version") or counters.get("modem_rejected_version"):
+        yield "frames of another version were heard: bring all vehicles to one release"
+    if counters.get("modem_rejected_plain"):
+        yield "unsealed frames were heard: give every vehicle the --key"
+    if counters.get("frames_sealed"):
+        yield "sealed frames were heard: give this vehicle the --key of the others"
 
 
 def _counters(folder: Path) -> dict[str, Mapping[str, float]]:

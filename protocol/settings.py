@@ -57,10 +57,11 @@ def _check(field: "dataclasses.Field[Any]", value: object) -> None:
         return
     if value != value:  # noqa: PLR0124  NaN compares unequal to itself
         raise ConfigError(f"{field.name} is NaN; give a number in {unit}")
+    shown = f"{field.name} is {value} {unit}".rstrip()
     if minimum is not None and value < minimum:
-        raise ConfigError(f"{field.name} is {value} {unit}; it must be at least {minimum}")
+        raise ConfigError(f"{shown}; it must be at least {minimum}")
     if maximum is not None and value > maximum:
-        raise ConfigError(f"{field.name} is {value} {unit}; it must be at most {maximum}")
+        raise ConfigError(f"{shown}; it must be at most {maximum}")
 
 
 def flatten(settings: Settings, prefix: str = "") -> Iterator[tuple[str, object, str, str]]:

@@ -26,7 +26,7 @@ from protocol.errors import (
     LocalProtocolError,
     RemoteProtocolError,
 )
-from protocol.packets import Answer, ExtendedAnswer, Header, Profile
+from protocol.packets import Answer, ExtendedAnswer, Header, Profile, SealedFrame
 from protocol.schedule import Slots
 from protocol.timestamps import from_quarters, to_quarters, transmission_s
 
@@ -104,6 +104,8 @@ class FollowerCore:
             return
         if not isinstance(packet, Answer | ExtendedAnswer) or packet.header.vehicle != 0:
             self.counters["frames_not_for_us"] += 1
+            self.counters["frames_with_our_number"] += packet.header.vehicle == self.vehicle
+            self.counters["frames_sealed"] += isinstance(packet, SealedFrame)
             return
         if isinstance(packet, ExtendedAnswer) and toa_s is not None:
             self._receive_range(packet, toa_s, now_s)

@@ -49,7 +49,13 @@ from firmware.submap_builder import SubmapBuilder
 from firmware.submaps import Submap, Track, joined
 from protocol.codec import decode, encode
 from protocol.errors import EstimationError, RemoteProtocolError
-from protocol.packets import Header, SubmapFragment, SubmapPacket, TrajectoryPacket
+from protocol.packets import (
+    Header,
+    SealedFrame,
+    SubmapFragment,
+    SubmapPacket,
+    TrajectoryPacket,
+)
 from protocol.reassembly import (
     FragmentArrived,
     Reassembler,
@@ -153,6 +159,8 @@ class LeaderCore:
         header = packet.header
         if not isinstance(packet, SubmapPacket | SubmapFragment | TrajectoryPacket):
             self.counters["frames_not_for_us"] += 1
+            self.counters["frames_with_our_number"] += header.vehicle == LEADER
+            self.counters["frames_sealed"] += isinstance(packet, SealedFrame)
             return
         if not 1 <= header.vehicle <= self._slots.settings.followers:
             self.counters["frames_of_unknown_vehicles"] += 1

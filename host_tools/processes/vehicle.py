@@ -22,6 +22,7 @@ from firmware.leader.worker import InlineWorker, ThreadWorker, Worker
 from firmware.ports import SensorStep
 from host_tools.collect import leader_record
 from host_tools.commands import Command
+from host_tools.link_status import advice_lines
 from host_tools.mapping import DepthMap
 from host_tools.mission import deployed
 from host_tools.processes.records import VehicleFiles
@@ -41,8 +42,10 @@ from host_tools.processes.voyage import Voyage, add_voyage_arguments, voyage_of
 from host_tools.simulator.vehicle import SimulatedVehicle
 from protocol.errors import ConfigError
 from protocol.modems.base import Modem, ModemContext
+from protocol.modems.dialect_driver import DialectDriver, await_identified, check_frame_size
 from protocol.modems.registry import open_modem
 from protocol.modems.sealed import SealedLink, SealedModem
+from protocol.packets import FRAME_BYTES, SMALL_FRAME_BYTES
 
 LEADER = 0
 BOOT_EPOCHS = 16
@@ -80,6 +83,10 @@ def run_vehicle(
     files = None if out is None else VehicleFiles(out, vehicle)
     starts = 0 if files is None else files.prepare()
     try:
+        profile = voyage.settings.follower.profile
+        is_small = profile == "lattice" and voyage.settings.follower.compression.small_frames
+        frame_bytes = SMALL_FRAME_BYTES if is_small else FRAME_BYTES
+        check_frame_size(modem.largest_frame_bytes, frame_bytes, profile)
         ticks = clock.ticks(voyage.tick_s)
         first_s = next(ticks, None)
         if first_s is None:
@@ -114,6 +121,8 @@ def _sail(aboard: Aboard, ticks: Iterator[float], *, on_wall: bool) -> None:
                 aboard.files.write_counters(aboard.loop.status())
             if on_wall:
                 print(_status_line(now_s, aboard.loop.status()), file=sys.stderr)
+            for line in advice_lines(aboard.loop.status()):
+                print(line, file=sys.stderr)
     except KeyboardInterrupt:
         if not on_wall:
             raise
@@ -197,11 +206,14 @@ def _modem_and_clock(
 ) -> tuple[Modem, WallClock | ServedClock]:
     context = ModemContext() if seal is None else ModemContext(stamp=seal.stamp)
     if clock_url == WALL:
-        modem = _sealed(open_modem(modem_url, context), seal)
+        modem = open_modem(modem_url, context)
         start_utc_s = start_time_s(start)
+        wall = WallClock(start_utc_s, voyage.settings.scenario.duration_s)
+        if isinstance(modem, DialectDriver):
+            await_identified(modem, wall.now_s, time.sleep)
         began = datetime.datetime.fromtimestamp(start_utc_s, datetime.UTC)
         print(f"the mission starts at {began:%Y-%m-%d %H:%M:%S} UTC", file=sys.stderr)
-        return modem, WallClock(start_utc_s, voyage.settings.scenario.duration_s)
+        return _sealed(modem, seal), wall
     if modem_url.startswith("serial:"):
         stamped = StampedModem(open_modem(modem_url, context))
         clock = ServedClock(clock_url, vehicle, voyage.fingerprint, stamped)

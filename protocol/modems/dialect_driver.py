@@ -5,6 +5,7 @@ hands both to `open_dialect`. The driver only moves bytes; the core does the tal
 the core's outbox survives a port that goes and comes back, and a modem that is power-cycled.
 """
 
+import dataclasses
 from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Protocol, TypeVar
@@ -239,6 +240,10 @@ def settings_from_url(url: ModemUrl, defaults: S) -> S:
     """
     if not url.path:
         raise ConfigError(f"{url.text} names no port; write e.g. {url.scheme}:///dev/ttyUSB0")
+    known = [field.name for field in dataclasses.fields(defaults)]
+    for name in url.query:
+        if name not in known:
+            raise ConfigError(f"{url.text}: unknown option {name!r}; known are {', '.join(known)}")
     try:
         return replace(defaults, dict(url.query))
     except ConfigError as error:

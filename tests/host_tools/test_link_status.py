@@ -1,5 +1,6 @@
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +11,18 @@ from firmware.follower.core import FollowerCore
 from firmware.follower.settings import FollowerSettings
 from firmware.ports import ModemPort
 from host_tools.cli import main
-from host_tools.link_status import status_lines
+from host_tools.link_status import advice_lines, status_lines
 from protocol.acoustics import Water, WaterSettings
+from protocol.codec import encode
 from protocol.modems.loopback import LoopbackMedium
 from protocol.modems.sealed import SealedLink, SealedModem
 from protocol.schedule import Slots, SlotSettings
 from protocol.seal import Keys, Opener, Sealer
 from protocol.seal_state import FileMarks, ReservedCounter
+from tests.protocol.strategies import paper_packet
+from tests.protocol.test_seal import sealed_frame
+
+START = ReckonedState(time_s=0.0, north_m=0.0, east_m=0.0, yaw_rad=0.0, depth_m=0.0)
 
 
 def folder_of(tmp_path: Path, counters: Mapping[str, float]) -> Path:
@@ -62,8 +68,7 @@ def test_what_a_vehicle_counts_has_its_place(tmp_path: Path) -> None:
     port = ModemPort(SealedModem(modem, link))
     link.open(b"noise")
     counter.next()
-    start = ReckonedState(time_s=0.0, north_m=0.0, east_m=0.0, yaw_rad=0.0, depth_m=0.0)
-    core = FollowerCore(1, 0, start, settings=FollowerSettings(), slots=Slots(SlotSettings()))
+    core = FollowerCore(1, 0, START, settings=FollowerSettings(), slots=Slots(SlotSettings()))
     core.receive_frame(bytes(30), None, 0.0)
     lines = list(status_lines(folder_of(tmp_path, {**core.status(), **port.status()})))
     assert "  rejected    crc 1, size 1" in lines
@@ -92,3 +97,26 @@ def test_a_folder_without_a_mission_is_one_line(
         (tmp_path / "summary.json").write_text(content)
     assert main(["link", "status", str(tmp_path)]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_numbers_and_addresses_given_twice_are_told_with_what_to_do() -> None:
+    def told(**counters: float) -> list[str]:
+        return list(advice_lines(counters))
+
+    assert told(modem_own_echoes=0) == []
+    assert "its own ?address=" in told(modem_own_echoes=2)[0]
+    assert "its own --vehicle" in told(frames_with_our_number=1)[0]
+    assert "its own --vehicle" in told(modem_rejected_reflected=1)[0]
+    assert "one release" in told(rejected_version=1)[0]
+    assert "--key" in told(modem_rejected_plain=1)[0]
+    assert "--key" in told(frames_sealed=1)[0]
+
+
+def test_a_vehicle_counts_frames_with_its_own_number_and_sealed_ones() -> None:
+    slots = Slots(SlotSettings(followers=2))
+    core = FollowerCore(2, 0, START, settings=FollowerSettings(), slots=slots)
+    packet = paper_packet()
+    core.receive_frame(encode(replace(packet, header=replace(packet.header, vehicle=2))), None, 0.0)
+    core.receive_frame(sealed_frame(), None, 0.0)
+    status = core.status()
+    assert (status["frames_with_our_number"], status["frames_sealed"]) == (1, 1)

@@ -96,7 +96,7 @@ def test_identification_returns_once_the_modem_has_answered(tmp_path: Path) -> N
     ("url", "advice"),
     [
         ("micromodem://", "names no port"),
-        ("micromodem:///dev/x?speed=9600", "unknown setting"),
+        ("micromodem:///dev/x?speed=9600", "unknown option .speed.; known are address"),
         ("micromodem:///dev/x?rate=9", "at most 6"),
         ("nanomodem:///dev/x?address=256", "at most 255"),
         ("evologics:///dev/x", "known are .*micromodem://"),

@@ -8,7 +8,7 @@ import pytest
 from protocol.acoustics import Water, WaterSettings
 from protocol.codec import decode, encode
 from protocol.errors import LocalProtocolError
-from protocol.modems.base import Modem, Reception
+from protocol.modems.base import LinkNotice, Modem, Reception
 from protocol.modems.loopback import LoopbackMedium
 from protocol.modems.sealed import SealedLink, SealedModem
 from protocol.packets import (
@@ -140,4 +140,24 @@ def test_the_seal_keeps_to_the_modem_under_it(vehicle: int) -> None:
     inner = medium().modem(vehicle)
     modem = SealedModem(inner, link(vehicle))
     assert (modem.largest_frame_bytes, modem.lead_s) == (inner.largest_frame_bytes, inner.lead_s)
+    assert modem.frames_per_packet == inner.frames_per_packet
     modem.close()
+
+
+def test_a_driver_with_a_lead_is_given_plain_frames_and_its_notices_pass() -> None:
+    inner = medium().modem(1)
+    inner.lead_s = 1.7
+    follower = SealedModem(inner, link(1))
+    handed: list[bytes] = []
+
+    def send(frame: bytes, now_s: float, start_s: float | None = None) -> None:
+        assert (now_s, start_s) == (2.3, 4.0)
+        handed.append(frame)
+
+    inner.send = send  # type: ignore[method-assign]
+    follower.send(encode(trajectory()), 2.3, 4.0)
+    assert handed == [encode(trajectory())]
+    notice = LinkNotice(text="the port is back", at_s=1.0)
+    events = iter([notice, None])
+    inner.next_event = lambda: next(events)  # type: ignore[method-assign]
+    assert follower.next_event() is notice

@@ -1,15 +1,19 @@
 """The commands themselves: real processes, real ports, and what they say when something is off."""
 
+import itertools
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from firmware.clock import WallClock
 from host_tools.cli import main
+from host_tools.emulators.ptys import PseudoPort
 from host_tools.processes.demo import Crew
 from host_tools.processes.vehicle import start_time_s
 from protocol.errors import ConfigError
@@ -68,12 +72,75 @@ def test_a_dying_process_ends_the_demo_with_one_line(
         (["follower", "--vehicle", "2", "--modem", "x"], "this scenario's followers are 1 to 1"),
         (["leader", "--modem", "serial:///dev/ptmx", "--start", "noon"], "such as 2026-05-01T12"),
         (["channel", "--ports", "/dev/null"], "give --ports a short path"),
+        (["leader", "--modem", "foo:///dev/ttyUSB0"], "known are loopback://, micromodem://, nano"),
+        (
+            ["leader", "--modem", "micromodem:///x?adress=2"],
+            "unknown option 'adress'; known are",
+        ),
+        (["leader", "--modem", "micromodem:///x?rate=9"], "rate is 9; it must be at most 6"),
+        (["leader", "--modem", "serial:///x", "--key", "/nowhere/key"], "openssl rand -hex 32"),
     ],
 )
 def test_what_is_wrong_with_a_port_or_a_clock_is_one_line(
     arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([*arguments, "--out", str(tmp_path), *SHORT]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+@pytest.fixture
+def line() -> Iterator[str]:
+    """The name of a port at whose other end nobody is."""
+    port = PseudoPort(9600)
+    yield port.name
+    port.close()
+
+
+def test_a_modem_that_does_not_answer_is_told_before_the_mission_starts(
+    line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = itertools.count()
+    monkeypatch.setattr(WallClock, "now_s", lambda _: next(clock) * 0.1)
+    monkeypatch.setattr("time.sleep", lambda _: None)
+    assert main(["follower", "--modem", f"nanomodem://{line}", *SHORT]) == 2
+    error = capsys.readouterr().err
+    assert "no answer from a nanomodem in 2 s at 9600 baud; check its power" in error
+    assert error.count("\n") == 1
+
+
+def test_a_modem_that_is_too_small_for_the_profile_is_told(
+    line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("host_tools.processes.vehicle.await_identified", lambda *_: {})
+    assert main(["leader", "--modem", f"nanomodem://{line}", *SHORT]) == 2
+    error = capsys.readouterr().err
+    assert "profile paper has frames of 256 bytes, this modem carries 62; take profile" in error
+
+
+@pytest.mark.parametrize(
+    ("mode", "digits", "more", "message"),
+    [
+        (0o600, 64, [], "--key needs --store"),
+        (0o644, 64, ["--store"], "has mode 0644; type: chmod 600"),
+        (0o600, 60, ["--store"], "holds 60 characters, not 64 hexadecimal digits"),
+        (0o600, 64, ["--profile", "dense", "--store"], "a dense frame has no room for a seal"),
+    ],
+)
+def test_a_key_that_cannot_be_used_is_one_line(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    mode: int,
+    digits: int,
+    more: list[str],
+    message: str,
+) -> None:
+    key = tmp_path / "key"
+    key.write_text("0" * digits)
+    key.chmod(mode)
+    store = [*more, str(tmp_path / "store")] if more else []
+    assert main(["leader", "--modem", "serial:///x", "--key", str(key), *store, *SHORT]) == 2
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1

@@ -16,7 +16,8 @@ from protocol.codec import encode
 SCRIPT = dissector.FOLDER / "fathomlink.lua"
 
 
-def test_the_dissector_is_what_the_command_makes() -> None:
+def test_the_dissector_is_ready_made_and_what_the_command_makes() -> None:
+    """MAVLink's users had to make theirs: pymavlink issue 133."""
     assert SCRIPT.read_text() == dissector.script(), "run: python -m host_tools.dissector"
 
 

@@ -1,6 +1,7 @@
 """One mission trial: journaled cores in their loops, faults, then quiet, and all is well again."""
 
 import logging
+import math
 import tempfile
 import traceback
 from collections.abc import Iterator
@@ -29,6 +30,8 @@ FIRST_S, SPAN_S = 60.0, 90.0
 MOST_BYTES = 6_000_000
 """What a follower holds at most: ten minutes of track, a sub-map measured, one fitted, a queue."""
 LOOK_S = 30.0
+ASTRAY_M = 40.0
+"""Two sigmas of what a leader knows before its first closures."""
 _TAKEN = (
     "frames_received",
     "frames_rejected",
@@ -43,6 +46,7 @@ _TAKEN = (
 )
 
 
+_CLOCKS = (Fault.CLOCK_AHEAD, Fault.CLOCK_BEHIND)
 _SPOILERS = (Fault.STORE_CORRUPT, Fault.STORE_READ_ONLY)
 """Faults after which a store may be set aside, or done without."""
 
@@ -135,8 +139,27 @@ class MissionTrial:
                 base = [self._progress(0), self._progress(1)]
             elif all(self._progress(vehicle) > base[vehicle] for vehicle in (0, 1)):
                 self._look()
+                self._hold_beliefs_to_truth()
                 return now_s - last_s
         return None
+
+    def _hold_beliefs_to_truth(self) -> None:
+        """Check that nobody was led astray: worse than dead reckoning a belief may be, not wild.
+
+        A clock that was wrong moves the truth itself, and who lost a store begins where he drifted.
+        """
+        kinds = self.plan.kinds(0) | self.plan.kinds(1)
+        if kinds & {*_SPOILERS, *_CLOCKS, Fault.DISK_FULL}:
+            return
+        for vehicle, sailor in self._sailors.items():
+            truth = self._survey.vehicles[vehicle].true_position(self.rig.now_s)[:2]
+            reckoned = sailor.core.reckoned
+            drifted_m = math.dist((reckoned.north_m, reckoned.east_m), truth)
+            wrong_m = math.dist(sailor.core.belief().position_m, truth)
+            if wrong_m > drifted_m + ASTRAY_M:
+                self.violations.append(
+                    f"vehicle {vehicle} is {wrong_m:.0f} m off, dead reckoning {drifted_m:.0f} m"
+                )
 
     def _progress(self, vehicle: int) -> int:
         """Return what a vehicle has made of the other's frames: placed sub-maps, used answers."""
@@ -184,7 +207,7 @@ class MissionTrial:
         owed = self._sailors[vehicle].acknowledged if vehicle in self._sailors else 0
         counters = core.recorder.journal.counters
         if counters["store_set_aside"] or counters["store_lost"]:
-            excused = {Fault.CLOCK_AHEAD, Fault.CLOCK_BEHIND} & self.plan.kinds(vehicle)
+            excused = set(_CLOCKS) & self.plan.kinds(vehicle)
             if self.plan.active(Fault.DISK_FULL, vehicle, self.rig.now_s) is not None:
                 excused.add(Fault.DISK_FULL)
             if not excused and fate.struck not in _SPOILERS:

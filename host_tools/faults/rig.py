@@ -27,6 +27,8 @@ RECOVERY_S = 600.0
 
 _FORGETFUL = (Fault.DISK_FULL, Fault.STORE_READ_ONLY)
 """With no disk for its marks, a receiver that dies may take a replayed frame for a new one."""
+CLOCK_AT_ZERO_S = 50_000_000
+"""What a vehicle's clock shows when the trial begins: counters are never small at sea."""
 
 Start = Callable[[int, SealedModem, Fate, float], Program]
 """Vehicle, modem, fate and local time, to a program that has just been started."""
@@ -122,7 +124,8 @@ class Rig:
         modem = FaultyModem(vehicle, self.medium.modem(vehicle), self.plan, modem_rng, clock)
 
         def begin(now_s: float) -> Program:
-            counter = ReservedCounter(Path("counter"), floor=max(int(now_s), 0), files=files)
+            floor = CLOCK_AT_ZERO_S + int(now_s)
+            counter = ReservedCounter(Path("counter"), floor=floor, files=files)
             marks = FileMarks(Path("marks"), files)
             link = WatchedLink(Sealer(KEYS, counter), Opener(vehicle, KEYS, marks))
             link.seen = self._seen[vehicle]

@@ -104,6 +104,13 @@ def test_an_acknowledged_frame_that_is_lost_is_found(
     assert found(mission_trial(seed, survey), "frames that it acknowledged")
 
 
+def test_a_belief_that_was_led_astray_is_found(
+    monkeypatch: pytest.MonkeyPatch, survey: Survey
+) -> None:
+    monkeypatch.setattr("host_tools.faults.mission_trial.ASTRAY_M", -1000.0)
+    assert found(mission_trial(seed_of(Fault.DUPLICATED, 0), survey), "m off, dead reckoning")
+
+
 def test_held_bytes_counts_all_that_is_reached_once() -> None:
     data = bytes(10_000)
     assert 10_000 < held_bytes([data, {"again": data}]) < 11_000

@@ -102,14 +102,15 @@ class FaultyMedium(LoopbackMedium):
         return replace(delivery, frame=self._damaged(fault, delivery.frame))
 
     def _damaged(self, fault: Fault, frame: bytes) -> bytes:
-        cut = int(self._rng.integers(1, len(frame)))
+        cut = int(self._rng.integers(0, len(frame) + 1))
         if fault is Fault.TRUNCATED:
             return frame[:cut]
         if fault is Fault.SPLICED:
             other = self._recorded[int(self._rng.integers(len(self._recorded)))].frame
             return frame[:cut] + other[cut:]
         damaged = bytearray(frame)
-        for bit in self._rng.integers(0, 8 * len(frame), size=int(self._rng.integers(1, 40))):
+        count = int(self._rng.integers(1, 40)) if frame else 0
+        for bit in self._rng.integers(0, 8 * max(len(frame), 1), size=count):
             damaged[bit >> 3] ^= 1 << (bit & 7)
         return bytes(damaged)
 

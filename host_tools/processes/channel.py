@@ -180,6 +180,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 def _run(arguments: argparse.Namespace) -> None:
     out = prepare_folder(arguments.out)
+    arguments.changes = [*MODEMS[arguments.modems], *arguments.changes]
     voyage = voyage_of(arguments)
 
     def ready(fleet: Fleet) -> None:

@@ -21,6 +21,7 @@ from host_tools.processes.channel import (
     host_mission,
     vehicle_command,
 )
+from host_tools.processes.emulated_modems import MODEMS
 from host_tools.processes.fleet import Fleet
 from host_tools.processes.records import FOLDER
 from host_tools.processes.remote_node import RemoteNode
@@ -141,6 +142,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 def _run(arguments: argparse.Namespace) -> None:
     out = prepare_folder(arguments.out)
+    arguments.changes = [*MODEMS[arguments.modems], *arguments.changes]
     voyage = voyage_of(arguments)
     total_s = round(voyage.settings.scenario.duration_s)
     began_s = time.monotonic()

@@ -15,7 +15,17 @@ from host_tools.processes.remote_node import RemoteNode
 from protocol.acoustics import Delivery, Water
 from protocol.modems.micromodem_settings import FRAMES_AND_BYTES
 
-MODEMS = ("raw", "micromodem", "nanomodem")
+MODEMS: dict[str, tuple[str, ...]] = {
+    "raw": (),
+    "micromodem": (
+        "slots.follower_slot_s=8",
+        "slots.frames_per_slot=2",
+        "slots.leader_period_s=40",
+        "slots.leader_offsets_s=5,13,21,29",
+    ),
+    "nanomodem": (),
+}
+"""What is at the ports, and the slots that it needs: a pair of frames sounds for three seconds."""
 _BAUD = {"micromodem": 19_200, "nanomodem": 9_600}
 HANDOVER_S = 2.0
 """Of real time: a kernel that has not passed bytes on by then has lost them."""

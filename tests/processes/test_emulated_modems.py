@@ -18,7 +18,6 @@ from protocol.modems.loopback import LoopbackMedium
 from protocol.schedule import Slots, SlotSettings
 
 START = ReckonedState(time_s=0.0, north_m=0.0, east_m=0.0, yaw_rad=0.0, depth_m=0.0)
-PAIRS = ("follower_slot_s=8", "leader_period_s=40", "leader_offsets_s=5,13,21,29")
 
 
 class Loading:
@@ -77,8 +76,7 @@ def test_a_follower_has_as_many_frames_for_a_slot_as_it_holds() -> None:
 @pytest.mark.slow
 def test_a_mission_on_emulated_micromodems_at_rate_4(tmp_path: Path) -> None:
     short = ["duration_min=4", "follower_duration_min=4", "leg_m=100", "beams=32"]
-    changes = [*short, *PAIRS, "frames_per_slot=2"]
-    arguments = [part for change in changes for part in ("--set", change)]
+    arguments = [part for change in short for part in ("--set", change)]
     for name in ("one", "two"):
         assert (
             main(["demo", "--modems", "micromodem", "--out", str(tmp_path / name), *arguments]) == 0
@@ -90,7 +88,9 @@ def test_a_mission_on_emulated_micromodems_at_rate_4(tmp_path: Path) -> None:
     starts = [frame["t_tx_s"] for frame in ours]
     assert len(ours) >= 30
     assert starts[::2] == starts[1::2]
-    assert all(start % 8.0 == 0.0 for start in starts)
+    told = [decode(bytes.fromhex(f["hex"])).header.tx_second for f in ours if f["fate"] != "lost"]
+    assert told == [f["t_tx_s"] % 16.0 for f in ours if f["fate"] != "lost"]
+    assert sum(start % 8.0 == 0.0 for start in starts) >= 0.9 * len(starts)  # or a second later
     assert {f["fate"] for f in ours[::2]} >= {"delivered", "lost"}
     assert [f["fate"] for f in ours[::2]] == [f["fate"] for f in ours[1::2]]
     leader = json.loads((tmp_path / "one" / "processes" / "leader.json").read_text())

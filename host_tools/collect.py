@@ -1,5 +1,6 @@
 """A finished mission's nodes as the values that the evaluation reads."""
 
+import dataclasses
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -8,6 +9,7 @@ import numpy as np
 from firmware.geometry import Array
 from firmware.leader.closure_log import Verdict
 from firmware.leader.core import LeaderCore
+from firmware.leader.observability import Quantity
 from firmware.leader.trajectory import Trajectory
 from host_tools.mapping import DepthMap
 from host_tools.mission_settings import MissionSettings
@@ -35,24 +37,48 @@ COVARIANCES_AT_ONCE = 16
 class LeaderRecord:
     """What the leader holds at the end: trajectories by vehicle, closures, and its sheets.
 
-    covariances_m2 are (T, 2, 2) on the mission's 1 Hz grid. patches is read once.
+    covariances_m2 are (T, 2, 2) on the mission's 1 Hz grid. patches is read once. quantities are
+    what is known of the vehicles together, remarks the same in words.
     """
 
     trajectories: Mapping[int, Trajectory]
     covariances_m2: Mapping[int, Array]
     closures: Sequence[ClosureResult]
     patches: Iterable[SoundingPatch]
+    quantities: Sequence[Mapping[str, object]] = ()
+    remarks: Sequence[str] = ()
 
 
 def leader_record(leader: LeaderCore, time_s: Array, window: Window) -> LeaderRecord:
     """Return what a leader holds."""
     vehicles = leader.vehicles()
+    seen = leader.observe(leader.reckoned.time_s)
     return LeaderRecord(
         trajectories={vehicle: leader.trajectory(vehicle) for vehicle in vehicles},
         covariances_m2={v: final_covariances(v, time_s, leader) for v in vehicles},
         closures=[closure_result(verdict) for verdict in leader.verdicts()],
         patches=sheet_patches(leader, window),
+        quantities=[] if seen is None else [as_row(q) for q in seen.quantities],
+        remarks=[*([] if seen is None else seen.lines()), *seabed_remarks(leader.status())],
     )
+
+
+def as_row(quantity: Quantity) -> dict[str, object]:
+    """Return a quantity as plain data."""
+    return {**dataclasses.asdict(quantity), "is_undetermined": quantity.is_undetermined}
+
+
+def seabed_remarks(counters: Counters) -> list[str]:
+    """Return how often the seabed had nothing to hold on to, where it was often."""
+    flat = counters.get("match_featureless", 0.0)
+    vague = counters.get("match_ambiguous", 0.0) + counters.get("match_loose", 0.0)
+    found = sum(n for name, n in counters.items() if name.startswith("closures_believed"))
+    if flat + vague <= found:
+        return []
+    return [
+        f"{flat + vague:.0f} overlaps gave no closure for want of relief ({flat:.0f} on flat "
+        f"seabed, {vague:.0f} ambiguous), {found:.0f} did: more lines here tell little of position"
+    ]
 
 
 def mission_result(
@@ -112,6 +138,8 @@ def result_of_record(
         patches=record.patches,
         truth_map=truth_map,
         counters=counters,
+        quantities=record.quantities,
+        remarks=record.remarks,
         settings={key: value for key, value, *_ in flatten(settings)},
     )
 

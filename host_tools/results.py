@@ -83,8 +83,8 @@ class MissionResult:
     """A whole mission, ready to be judged and written.
 
     truth_map was fed, sounding by sounding, by the simulated vehicles. patches is read once.
-    counters are grouped by their owner (leader, follower_1, water ...). remarks are lines on what
-    the estimator calls unobservable.
+    counters are grouped by their owner (leader, follower_1, water ...). quantities and
+    remarks are what the estimator knows of the vehicles together, in numbers and in words.
     """
 
     scenario: ScenarioSettings
@@ -99,4 +99,5 @@ class MissionResult:
     truth_map: DepthMap
     counters: Mapping[str, Counters]
     remarks: Sequence[str] = ()
+    quantities: Sequence[Mapping[str, object]] = ()
     settings: Mapping[str, object] = field(default_factory=dict)

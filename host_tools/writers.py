@@ -207,6 +207,7 @@ def summarise(result: MissionResult, evaluation: Evaluation) -> dict[str, object
             "tiles": as_plain(evaluation.tiles),
         },
         "remarks": list(result.remarks),
+        "observability": list(result.quantities),
         "settings": as_plain(result.settings),
     }
 

@@ -31,6 +31,11 @@ def vehicle_of(chain: int) -> int:
     return chain % BOOT_EPOCHS
 
 
+def name_of(vehicle: int) -> str:
+    """Return a vehicle's name in text."""
+    return "leader" if vehicle == LEADER else f"follower {vehicle}"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SheetId:
     """Which sub-map of which vehicle, in which of its boots: epochs counted on without a wrap."""

@@ -15,7 +15,7 @@ import numpy as np
 from firmware.belief import Belief
 from firmware.dead_reckoning import DeadReckoning, ReckonedState
 from firmware.leader.answers import Answers
-from firmware.leader.atlas import LEADER, Atlas, Sheet, SheetId, sheet_of
+from firmware.leader.atlas import LEADER, Atlas, Sheet, SheetId, name_of, sheet_of
 from firmware.leader.closure_log import ClosureLog, Verdict, verdict_of
 from firmware.leader.closures import (
     Closure,
@@ -32,6 +32,7 @@ from firmware.leader.fleet import Fleet
 from firmware.leader.judgement import Judgement
 from firmware.leader.ledger import Anchor
 from firmware.leader.matching import MatchOutcome
+from firmware.leader.observability import Observability, observe
 from firmware.leader.own_grid import grid_of
 from firmware.leader.pairing import Calibrations
 from firmware.leader.pose_graph import PoseGraph
@@ -125,6 +126,7 @@ class LeaderCore:
         self._sheets_judged = 0
         self._jobs_out = False
         self.composed_s = start.time_s
+        self.observability: Observability | None = None  # of that time
         self._sheets_to_match: deque[Sheet] = deque(maxlen=16)
         self._ranges_used_s: dict[int, float] = {}
         self._next_slot_s = slots.next_slot_s(LEADER, start.time_s)
@@ -310,9 +312,35 @@ class LeaderCore:
             "bad_beams": self._builder.bad_beams,
             "bad_pings": self._builder.bad_pings,
             "graph_rebuilds": self.graph.rebuilds,
+            **self._outlook(),
         }
 
+    def observe(self, now_s: float) -> Observability | None:
+        """Return what the geometry leaves open of the vehicles' newest states; None if unknown."""
+        vehicles = self.vehicles()
+        chains = [self.fleet.newest_chain(vehicle) for vehicle in vehicles]
+        names = [name_of(vehicle) for vehicle in vehicles]
+        try:
+            joint, reckoned = (
+                self.graph.newest_covariance(chains, reckoned=alone) for alone in (False, True)
+            )
+            positions_m = [self.graph.trajectory(chain).position_m[-1] for chain in chains]
+            return observe(now_s, names, np.array(positions_m), joint, reckoned)
+        except (EstimationError, np.linalg.LinAlgError):
+            return None
+
     # inside
+
+    def _outlook(self) -> dict[str, int]:
+        """Return the last observation in numbers for a status line."""
+        seen = self.observability
+        if seen is None:
+            return {}
+        return {
+            "joint_sigma_cm": round(100.0 * seen.worst_m),
+            "undetermined_quantities": sum(q.is_undetermined for q in seen.quantities),
+            "undetermined_directions": seen.blind,
+        }
 
     def _compose(self, now_s: float) -> None:
         """Make the past coarse, so that a day costs no more an hour than its first hours."""
@@ -332,6 +360,7 @@ class LeaderCore:
         moves_m = corrections(old, self.graph)
         for sheet_id in redundant(old, moves_m, self._settings.coverage):
             self.atlas.shelve(sheet_id)
+        self.observability = self.observe(now_s)
 
     def _add_own(self, stretch: Submap) -> None:
         """Join the newest stretches to a sub-map, so that one ends every hop."""

@@ -156,6 +156,10 @@ class Fleet:
         begun = [c for c in chains if self.track(c).time_s[0] <= time_s]
         return begun[-1] if begun else chains[0]
 
+    def newest_chain(self, vehicle: int) -> int:
+        """Return the chain of a vehicle's newest boot."""
+        return self._chains(vehicle)[-1]
+
     def _chains(self, vehicle: int) -> list[int]:
         chains = [c for c in self._graph.vehicles() if vehicle_of(c) == vehicle]
         return sorted(chains, key=lambda chain: float(self.track(chain).time_s[0]))

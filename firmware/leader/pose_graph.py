@@ -45,6 +45,7 @@ from protocol.errors import EstimationError
 from protocol.settings import Settings, setting
 
 _Kind = TypeVar("_Kind", bound=Record)
+_RECKONING = (PriorRecord, OdometryRecord, SharedDriftRecord, SharedWalkRecord)
 _PLAIN = ("_settings", "_chains", "_ledger", "_entered", "_factorization", "rebuilds")
 _SETTLING_STEPS = 4  # a robust weight follows its residual one step late
 
@@ -397,6 +398,27 @@ class PoseGraph:
         origin_m, target_m = (self._state(end.key)[:2] for end in ends)
         parameters = [self._state(end.parameters) for end in ends]
         return record.innovation_m(origin_m, target_m, (parameters[0], parameters[1]))
+
+    def newest_covariance(self, vehicles: list[int], *, reckoned: bool) -> Array:
+        """Return the joint covariance (4V, 4V) of vehicles' newest states.
+
+        `reckoned` leaves out closures, ranges and fixes: what dead reckoning alone would know.
+        Raises EstimationError if the information matrix is singular.
+        """
+        self.update()
+        isam = self._isam
+        try:
+            if reckoned:
+                graph = gtsam.NonlinearFactorGraph()
+                for entry in self._ledger.values():
+                    if isinstance(entry.record, _RECKONING):
+                        graph.push_back(factor_of(entry.record, self._settings.robust_kernel))
+                isam = new_isam(self._factorization)
+                isam.update(graph, self._values)
+            keys = [self._chains[vehicle].keys[-1] for vehicle in vehicles]
+            return np.asarray(isam.jointMarginalCovariance(keys).fullMatrix())
+        except RuntimeError as error:
+            raise EstimationError("the information matrix is singular") from error
 
     def chi_square(self, number: int) -> float:
         """Return the squared innovation of a closure in units of its covariance."""

@@ -106,7 +106,13 @@ class VehicleFiles:
             columns = np.stack([getattr(patch, field) for field in _PATCH])
             arrays[f"patch.{patch.vehicle}.{k}"] = columns
         closures = [dataclasses.asdict(closure) for closure in record.closures]
-        np.savez(self._path("npz"), closures=np.array(json.dumps(closures)), **arrays)
+        seen = json.dumps({"quantities": record.quantities, "remarks": record.remarks})
+        np.savez(
+            self._path("npz"),
+            closures=np.array(json.dumps(closures)),
+            seen=np.array(seen),
+            **arrays,
+        )
 
     def record(self) -> LeaderRecord:
         """Return what the leader holds."""
@@ -119,6 +125,7 @@ class VehicleFiles:
                     ClosureResult(**closure) for closure in json.loads(str(arrays["closures"]))
                 ],
                 patches=self._patches(),
+                **json.loads(str(arrays["seen"])),
             )
 
     def _patches(self) -> Iterator[SoundingPatch]:

@@ -148,7 +148,11 @@ def _closure_table(evaluation: Evaluation) -> str:
 def _remarks(remarks: Sequence[str]) -> str:
     if not remarks:
         return "<p>The estimator reported nothing as unobservable.</p>"
-    return "<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in remarks) + "</ul>"
+    lines = [
+        f"<li{' class=warn' if ': undetermined' in line else ''}>{html.escape(line)}</li>"
+        for line in remarks
+    ]
+    return f"<ul>{''.join(lines)}</ul>"
 
 
 def _link_text(result: MissionResult) -> str:

@@ -13,9 +13,10 @@ import numpy as np
 
 from firmware.dead_reckoning import ReckonedState
 from firmware.geometry import Array
-from firmware.soundings import Odometry, Ping
+from firmware.soundings import Fix, Odometry, Ping
 
 _FIVE = struct.Struct("<5d")
+_FIX = struct.Struct("<i3d")
 _PING = struct.Struct("<5dI")
 _HEARD = struct.Struct("<2d")
 _INSTANT = struct.Struct("<d")
@@ -47,24 +48,33 @@ class Heard:
 
 def from_odometry(odometry: Odometry) -> bytes:
     """Return odometry as bytes."""
-    return _FIVE.pack(
+    body = _FIVE.pack(
         odometry.time_s,
         odometry.velocity_north_mps,
         odometry.velocity_east_mps,
         odometry.yaw_rad,
         odometry.depth_m,
     )
+    fix = odometry.fix
+    if fix is None:
+        return body
+    return body + _FIX.pack(fix.vehicle, fix.north_m, fix.east_m, fix.sigma_m)
 
 
 def to_odometry(body: bytes) -> Odometry:
     """Return the odometry of bytes."""
-    time_s, north_mps, east_mps, yaw_rad, depth_m = _FIVE.unpack(body)
+    time_s, north_mps, east_mps, yaw_rad, depth_m = _FIVE.unpack_from(body)
+    fix = None
+    if len(body) > _FIVE.size:
+        vehicle, north_m, east_m, sigma_m = _FIX.unpack_from(body, _FIVE.size)
+        fix = Fix(vehicle=vehicle, north_m=north_m, east_m=east_m, sigma_m=sigma_m)
     return Odometry(
         time_s=time_s,
         velocity_north_mps=north_mps,
         velocity_east_mps=east_mps,
         yaw_rad=yaw_rad,
         depth_m=depth_m,
+        fix=fix,
     )
 
 

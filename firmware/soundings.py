@@ -26,14 +26,29 @@ class Ping:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Fix:
+    """An absolute position in NED, of the leader (0) by GNSS, or by USBL of any vehicle."""
+
+    vehicle: int = 0
+    north_m: float
+    east_m: float
+    sigma_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Odometry:
-    """The velocity over ground (Doppler log in the attitude reference), in NED, at one instant."""
+    """The velocity over ground (Doppler log in the attitude reference), in NED, at one instant.
+
+    With it comes the fix of that instant, if there is one; followers make no use of theirs, because
+    what they send is raw dead reckoning.
+    """
 
     time_s: float
     velocity_north_mps: float
     velocity_east_mps: float
     yaw_rad: float
     depth_m: float
+    fix: Fix | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -84,7 +84,7 @@ def local_nodes(
 
 def deployed(vehicle: SimulatedVehicle) -> ReckonedState:
     """Return where and how a vehicle was put into the water: the start of its dead reckoning."""
-    north_m, east_m, depth_m = vehicle.true_position(0.0)
+    north_m, east_m, depth_m = vehicle.told_start()
     return ReckonedState(time_s=0.0, north_m=north_m, east_m=east_m, yaw_rad=0.0, depth_m=depth_m)
 
 

@@ -23,7 +23,14 @@ class MissionSettings(Settings):
 def changed(settings: MissionSettings, changes: Mapping[str, object]) -> MissionSettings:
     """Return the settings with changes by dotted or short key.
 
+    The leader is told how uncertain the scenario makes the starts.
+
     Raises ConfigError for a key that is unknown or ambiguous, or a value out of bounds.
     """
     settings = replace(settings, changes, prefer="scenario")
-    return replace(settings, {"slots.followers": max(settings.scenario.followers, 1)})
+    told_m = max(settings.leader.graph.start_sigma_m, settings.scenario.start_error_m)
+    derived = {
+        "slots.followers": max(settings.scenario.followers, 1),
+        "leader.graph.start_sigma_m": told_m,
+    }
+    return replace(settings, derived)

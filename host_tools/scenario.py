@@ -106,6 +106,14 @@ class ScenarioSettings(Settings):
     )
     current_period_min: float = setting(60.0, "min", "one turn of the current", minimum=1.0)
 
+    gnss_fix_every_min: float = setting(
+        0.0, "min", "the leader surfaces for a fix; 0: never", minimum=0.0
+    )
+    gnss_sigma_m: float = setting(3.0, "m", "error of a fix, each axis", minimum=0.01)
+    start_error_m: float = setting(
+        0.0, "m", "sigma of where vehicles are told they begin, each axis", minimum=0.0
+    )
+
     water: WaterSettings = field(default_factory=WaterSettings)
 
     @property

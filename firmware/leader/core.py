@@ -28,6 +28,7 @@ from firmware.leader.closures import (
 )
 from firmware.leader.composition import detail_from_s
 from firmware.leader.coverage import redundant
+from firmware.leader.fixes import Fixes
 from firmware.leader.fleet import Fleet
 from firmware.leader.judgement import Judgement
 from firmware.leader.ledger import Anchor
@@ -118,6 +119,7 @@ class LeaderCore:
         self._reassembler = Reassembler(patient_reassembly(settings, slots))
         self._ranging = Ranging(settings.ranges)
         self.fleet = Fleet(self.graph, self._ranging, settings.fleet)
+        self._fixes = Fixes(settings.fixes)
         self._answers = Answers(
             boot_epoch, self.fleet, self.graph, extended=settings.answers == "extended"
         )
@@ -139,6 +141,8 @@ class LeaderCore:
         """Advance dead reckoning; a finished sub-map becomes a sheet of the atlas."""
         state = self._reckoning.receive_odometry(odometry)
         self._builder.receive_state(state)
+        if odometry.fix is not None:
+            self._fixes.hold(odometry.time_s, odometry.fix)
         track = self.fleet.own
         if not len(track) or state.time_s == math.floor(state.time_s):
             track.add(state.time_s, state.north_m, state.east_m, state.yaw_rad)
@@ -186,6 +190,7 @@ class LeaderCore:
                 self._receive_fragment(event.fragment, now_s)
             else:
                 self._add_transfer(event)
+        self._fixes.use(self.fleet, self.graph, now_s)
         interval_s = self._settings.composition.interval_s
         if now_s - self.composed_s >= interval_s and not self._jobs_out:
             self.composed_s = now_s
@@ -303,6 +308,7 @@ class LeaderCore:
             **self.fleet.counters,
             **self._answers.counters,
             **self._ranging.counters,
+            **self._fixes.counters,
             **self._judgement.counters,
             **{
                 f"reassembly_{k}": v
@@ -348,13 +354,13 @@ class LeaderCore:
         self.graph.compose(now_s, settings)
         detail_s = detail_from_s(now_s, settings)
         self._judgement.forget(detail_s, self.graph)
-        open_closures = []
-        for closure in self._closures:
-            if closure.number in self.graph:
-                open_closures.append(closure)
+        waiting, self._closures = self._closures, []
+        for closure in waiting:
+            newest_s = max(closure.origin_anchor.time_s, closure.target_anchor.time_s)
+            if closure.number in self.graph and newest_s >= detail_s:
+                self._closures.append(closure)
             else:
                 self._settled.add(closure)
-        self._closures = open_closures
         self.fleet.settle(detail_s)
         old = [sheet for sheet in self.atlas if sheet.time_s < detail_s]
         moves_m = corrections(old, self.graph)

@@ -156,6 +156,11 @@ class Fleet:
         begun = [c for c in chains if self.track(c).time_s[0] <= time_s]
         return begun[-1] if begun else chains[0]
 
+    def reaches(self, vehicle: int, time_s: float) -> bool:
+        """Return whether dead reckoning of a vehicle is known up to a time."""
+        chains = self._chains(vehicle)
+        return bool(chains) and float(self.track(chains[-1]).time_s[-1]) >= time_s
+
     def newest_chain(self, vehicle: int) -> int:
         """Return the chain of a vehicle's newest boot."""
         return self._chains(vehicle)[-1]

@@ -47,6 +47,9 @@ from protocol.settings import Settings, setting
 _Kind = TypeVar("_Kind", bound=Record)
 _RECKONING = (PriorRecord, OdometryRecord, SharedDriftRecord, SharedWalkRecord)
 _PLAIN = ("_settings", "_chains", "_ledger", "_entered", "_factorization", "rebuilds")
+_WORN = 1.3
+"""ISAM2 eliminates the newest variables last, and fills: so much of that, and it is built anew."""
+
 _SETTLING_STEPS = 4  # a robust weight follows its residual one step late
 
 
@@ -106,6 +109,8 @@ class PoseGraph:
         self._fresh = gtsam.Values()
         self._factorization = "CHOLESKY"  # until it calls a long chain indeterminate: then QR
         self._isam = new_isam(self._factorization)
+        self._factors: dict[int, gtsam.NonlinearFactor] = {}  # of the ledger, once made
+        self._tree_entries = 0  # of ISAM2 when it was built
         self._trajectories: dict[int, Trajectory] = {}  # both until the next change
         self._newest_covariance: dict[int, Array] = {}
         self.rebuilds = 0
@@ -126,10 +131,9 @@ class PoseGraph:
         for key, vector in state.pop("about").items():
             about.insert(key, vector)
         self.__dict__.update(state)
-        self._changed, self._fresh = set(), gtsam.Values()
+        self._changed, self._fresh, self._factors = set(), gtsam.Values(), {}
         self._trajectories, self._newest_covariance = {}, {}
         self._rebuild(about)
-        self.rebuilds = state["rebuilds"]
 
     def add_vehicle(
         self,
@@ -283,7 +287,7 @@ class PoseGraph:
         for number in sorted(self._changed):
             entry = self._ledger[number]
             if entry.active and entry.slot is None:
-                added.push_back(factor_of(entry.record, self._settings.robust_kernel))
+                added.push_back(self._factor(number))
                 numbers.append(number)
             elif not entry.active and entry.slot is not None:
                 removed.append(entry.slot)
@@ -296,10 +300,13 @@ class PoseGraph:
                 if self._isam.update().getVariablesRelinearized() == 0:
                     break
             self._values = self._isam.calculateEstimate()
+            if self._isam.treeNnz() > _WORN * self._tree_entries:
+                self._rebuild(self._values)
         except RuntimeError:
             self._factorization = "QR"
             self._values.insert(self._fresh)
             self._rebuild(self._values)
+            self.rebuilds += 1
         self._fresh = gtsam.Values()
         self._changed.clear()
         self._forget_solution()
@@ -326,6 +333,7 @@ class PoseGraph:
         }
         coarse = Composition(owners, apart_m2, old, estimate, settings).coarse(self._ledger)
         self._ledger = dict(coarse.kept)
+        self._factors.clear()
         for record in coarse.new:
             self._enter(record)
         self._mend()
@@ -410,9 +418,9 @@ class PoseGraph:
         try:
             if reckoned:
                 graph = gtsam.NonlinearFactorGraph()
-                for entry in self._ledger.values():
+                for number, entry in self._ledger.items():
                     if isinstance(entry.record, _RECKONING):
-                        graph.push_back(factor_of(entry.record, self._settings.robust_kernel))
+                        graph.push_back(self._factor(number))
                 isam = new_isam(self._factorization)
                 isam.update(graph, self._values)
             keys = [self._chains[vehicle].keys[-1] for vehicle in vehicles]
@@ -514,11 +522,17 @@ class PoseGraph:
         values = self._values if self._values.exists(key) else self._fresh
         return np.asarray(values.atVector(key))
 
+    def _factor(self, number: int) -> gtsam.NonlinearFactor:
+        if number not in self._factors:
+            record = self._ledger[number].record
+            self._factors[number] = factor_of(record, self._settings.robust_kernel)
+        return self._factors[number]
+
     def _active_factors(self) -> tuple[gtsam.NonlinearFactorGraph, list[Entry]]:
         graph, entries = gtsam.NonlinearFactorGraph(), []
-        for entry in self._ledger.values():
+        for number, entry in self._ledger.items():
             if entry.active:
-                graph.push_back(factor_of(entry.record, self._settings.robust_kernel))
+                graph.push_back(self._factor(number))
                 entries.append(entry)
         return graph, entries
 
@@ -531,8 +545,8 @@ class PoseGraph:
         for entry, slot in zip(entries, result.getNewFactorsIndices(), strict=True):
             entry.slot = slot
         self._values = self._isam.calculateEstimate()
+        self._tree_entries = self._isam.treeNnz()
         self._forget_solution()
-        self.rebuilds += 1
 
     def _forget_solution(self) -> None:
         self._trajectories.clear()

@@ -7,6 +7,7 @@ from firmware.compression.settings import BinningSettings
 from firmware.leader.closures import ClosureSettings
 from firmware.leader.composition import CompositionSettings
 from firmware.leader.coverage import CoverageSettings
+from firmware.leader.fixes import FixSettings
 from firmware.leader.fleet import FleetSettings
 from firmware.leader.judgement import JudgementSettings
 from firmware.leader.matching import MatchingSettings
@@ -39,6 +40,7 @@ class LeaderSettings(Settings):
     graph: GraphSettings = setting(GraphSettings, "", "the pose graph")
     composition: CompositionSettings = setting(CompositionSettings, "", "the graph's past")
     coverage: CoverageSettings = setting(CoverageSettings, "", "which sub-maps are matched with")
+    fixes: FixSettings = setting(FixSettings, "", "GNSS and USBL")
     fleet: FleetSettings = setting(FleetSettings, "", "the followers' trajectories")
     answers: str = setting(
         "paper",

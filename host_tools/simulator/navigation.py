@@ -39,6 +39,9 @@ class NavigationErrors:
             for period_min, phase in zip(periods_min, phases, strict=True)
         ]
         self._current_phase = current_phase
+        self._fix_rng = np.random.default_rng([seed, vehicle, 5])
+        start = np.random.default_rng([seed, vehicle, 6])
+        self.start_error_m: Array = scenario.start_error_m * start.standard_normal(2)
 
     def reckoned_steps(self, time_s: Array, true_m: Array) -> Array:
         """Return the steps (T - 1, 2) that dead reckoning measures between true positions."""
@@ -61,6 +64,11 @@ class NavigationErrors:
             carried_m = self._scenario.current_mps / rate
             drift_m -= carried_m * np.stack([np.sin(angle), -np.cos(angle)], axis=1)
         return drift_m
+
+    def fix_m(self, true_m: Array) -> Array:
+        """Return a measured absolute position (2,) for the true one."""
+        noise = self._fix_rng.standard_normal(2)
+        return np.asarray(true_m + self._scenario.gnss_sigma_m * noise)
 
     def depth_offset_m(self, time_s: Array) -> Array:
         """Return measured less true depth (T,): tide and sensor, wandering over tens of minutes."""

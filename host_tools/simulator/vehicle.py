@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware.geometry import Array, wrap_angle
-from firmware.soundings import Odometry, Ping
+from firmware.soundings import Fix, Odometry, Ping
 from host_tools.scenario import ScenarioSettings
 from host_tools.simulator.lawnmower import Lawnmower
 from host_tools.simulator.multibeam import Multibeam, Poses
@@ -111,6 +111,7 @@ class SimulatedVehicle:
                     velocity_east_mps=float(chunk.velocity_mps[k, 1]),
                     yaw_rad=yaw_rad,
                     depth_m=depth_m,
+                    fix=self._fix(time_s),
                 )
                 if chunk.ranges_m is None or time_s > self._survey_s:
                     yield odometry, None
@@ -127,6 +128,22 @@ class SimulatedVehicle:
                         depth_m=depth_m,
                     ),
                 )
+
+    def told_start(self) -> tuple[float, float, float]:
+        """Return north, east, depth at which the vehicle is told that it begins."""
+        north_m, east_m, depth_m = self.true_position(0.0)
+        error_m = self._errors.start_error_m
+        return north_m + float(error_m[0]), east_m + float(error_m[1]), depth_m
+
+    def _fix(self, time_s: float) -> Fix | None:
+        """Return the fix that the leader has at an instant; it dives on as if it had not risen."""
+        every_s = 60.0 * self._scenario.gnss_fix_every_min
+        if self.index != 0 or not every_s or not time_s or time_s % every_s:
+            return None
+        north_m, east_m = self._errors.fix_m(np.array(self.true_position(time_s)[:2]))
+        return Fix(
+            north_m=float(north_m), east_m=float(east_m), sigma_m=self._scenario.gnss_sigma_m
+        )
 
     def _chunks(self) -> Iterator[_Chunk]:
         rate_hz = self._scenario.ping_hz

@@ -1,0 +1,111 @@
+"""Absolute positions: used where they fit, refused where not, late ones waited for."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from firmware.inputs import from_odometry, to_odometry
+from firmware.leader.core import LeaderCore
+from firmware.soundings import Fix, Odometry
+from host_tools.mission import local_nodes, run, simulated_vehicles, water_between
+from host_tools.mission_settings import MissionSettings, changed
+from host_tools.simulator.placement import place_survey
+from host_tools.simulator.terrain import open_terrain
+from tests.leader.vessels import convoy, leader_of, line, sail
+
+
+def sailed(seconds: int, fix: Fix | None = None) -> LeaderCore:
+    """Return a leader that sailed north, and was told a fix at the last instant."""
+    leader = leader_of(line(0.0, 0.0))
+    for quarter in range(1, 4 * seconds + 1):
+        sail(leader, line(0.0, 0.0), quarter / 4.0, sonar_on=False)
+        leader.tick(quarter / 4.0)
+    if fix is not None:
+        tell(leader, fix, seconds + 0.25)
+    return leader
+
+
+def tell(leader: LeaderCore, fix: Fix, at_s: float) -> None:
+    leader.receive_odometry(
+        Odometry(
+            time_s=at_s,
+            velocity_north_mps=2.0,
+            velocity_east_mps=0.0,
+            yaw_rad=0.0,
+            depth_m=10.0,
+            fix=fix,
+        )
+    )
+    sail(leader, line(0.0, 0.0), at_s + 1.75, sonar_on=False)
+    leader.tick(at_s + 1.75)
+
+
+def test_fix_moves_the_estimate_and_narrows_it() -> None:
+    fix = Fix(north_m=1210.0, east_m=20.0, sigma_m=2.0)
+    before, after = sailed(600).belief(), sailed(600, fix).belief()
+    assert np.hypot(*(after.position_m - [1213.5, 20.0])) < 3.0
+    assert np.trace(after.covariance_m2) < 0.05 * np.trace(before.covariance_m2)
+
+
+def test_fix_that_the_estimate_finds_impossible_is_counted_and_dropped() -> None:
+    leader = sailed(60, Fix(north_m=5000.0, east_m=0.0, sigma_m=2.0))
+    assert leader.status()["fixes_rejected"] == 1
+    assert leader.belief().position_m[0] == pytest.approx(123.5, abs=3.0)
+
+
+@pytest.mark.parametrize(("north_m", "sigma_m"), [(np.nan, 2.0), (120.0, 0.0), (120.0, np.nan)])
+def test_fix_without_numbers_is_counted(north_m: float, sigma_m: float) -> None:
+    fix = Fix(north_m=north_m, east_m=0.0, sigma_m=sigma_m)
+    assert sailed(60, fix).status()["fixes_bad"] == 1
+
+
+def test_fix_of_a_follower_waits_for_its_track() -> None:
+    sea = convoy().run(0.0, 30.0)
+    true_m = (-30.0 + 2.0 * 30.25, 60.0)
+    tell(sea.leader, Fix(vehicle=1, north_m=true_m[0], east_m=true_m[1], sigma_m=1.0), 30.25)
+    assert "fixes_used" not in sea.leader.status()
+    sea.run(32.0, 100.0)
+    assert sea.leader.status()["fixes_used"] == 1
+
+
+def test_fix_of_an_unknown_vehicle_is_given_up() -> None:
+    leader = sailed(60, Fix(vehicle=3, north_m=0.0, east_m=0.0, sigma_m=1.0))
+    leader.tick(1200.0)
+    assert leader.status()["fixes_too_late"] == 1
+
+
+def test_odometry_with_a_fix_reads_back_exactly() -> None:
+    fix = Fix(vehicle=2, north_m=1 / 3, east_m=-7.0, sigma_m=0.1)
+    sample = Odometry(
+        time_s=1.0, velocity_north_mps=2.0, velocity_east_mps=0.0, yaw_rad=0.1, depth_m=9.0, fix=fix
+    )
+    assert to_odometry(from_odometry(sample)) == sample
+    assert to_odometry(from_odometry(dataclasses.replace(sample, fix=None))).fix is None
+
+
+def test_uncertain_start_is_found_by_fixes() -> None:
+    misses_m = {}
+    for every_min in (0.0, 1.0):
+        settings = changed(
+            MissionSettings(),
+            {
+                "duration_min": 5.2,
+                "follower_duration_min": 5.0,
+                "leg_m": 60.0,
+                "beams": 16,
+                "followers": 0,
+                "start_error_m": 40.0,
+                "gnss_fix_every_min": every_min,
+            },
+        )
+        assert settings.leader.graph.start_sigma_m == 40.0
+        site = place_survey(open_terrain(None, 1), settings.scenario, 2)
+        vehicles = simulated_vehicles(settings, site, 2)
+        leader, _ = local_nodes(settings, vehicles)
+        water = water_between(settings, vehicles, 2)
+        run({0: leader}, water, duration_s=312.0, tick_s=0.25, record=lambda _: None)
+        true_m = vehicles[0].true_position(312.0)[:2]
+        misses_m[every_min] = float(np.hypot(*(leader.core.belief().position_m - true_m)))
+    assert misses_m[0.0] > 20.0
+    assert misses_m[1.0] < 8.0

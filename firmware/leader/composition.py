@@ -43,8 +43,15 @@ class CompositionSettings(Settings):
     piece_s: float = setting(
         60.0, "s", "between nodes beyond it: somewhat longer than a sub-map", minimum=10.0
     )
-    distant_s: float = setting(4 * 3600.0, "s", "beyond it pieces are longer", minimum=1200.0)
-    distant_piece_s: float = setting(240.0, "s", "between nodes of the distant past", minimum=10.0)
+    distant_s: float = setting(
+        3600.0,
+        "s",
+        "beyond it pieces are four times as long, and beyond four times it again",
+        minimum=1200.0,
+    )
+    levels: int = setting(
+        3, "", "pieces of 1, 4 and 16 minutes: nodes grow with the logarithm of time", minimum=1
+    )
     closures_per_piece: int = setting(
         3, "closures", "with older pieces; more say the same again", minimum=1
     )
@@ -56,6 +63,7 @@ class CompositionSettings(Settings):
     )
 
 
+_COARSER = 4  # from level to level, pieces and the age at which they begin alike
 Link = TypeVar("Link", ClosureRecord, RangeRecord)
 Group = list[tuple[int, Entry, Link]]  # of one pair of pieces: number, entry as it was, as moved
 
@@ -78,11 +86,15 @@ def kept_nodes(
 ) -> NDArray[np.bool_]:
     """Return which nodes (K,) of a chain stay: the first of each piece, and all in the detail."""
     s, times_s = settings, np.asarray(chain.times_s)
-    detail_s = detail_from_s(now_s, s)
-    distant_s = np.floor((now_s - s.distant_s) / s.distant_piece_s) * s.distant_piece_s
-    piece_s = np.where(times_s < distant_s, s.distant_piece_s, s.piece_s)
-    begins = np.diff(np.floor(times_s / piece_s) * piece_s, prepend=-np.inf) > 0
-    kept = begins | (times_s >= detail_s) | np.isin(chain.keys, sorted(pinned))
+    piece_from_s = times_s
+    for level in range(s.levels):
+        piece_s = s.piece_s * _COARSER**level
+        age_s = s.distant_s * _COARSER ** (level - 1) if level else s.detail_s
+        until_s = np.floor((now_s - age_s) / piece_s) * piece_s
+        begin_s = np.floor(times_s / piece_s) * piece_s
+        piece_from_s = np.where(times_s < until_s, begin_s, piece_from_s)
+    kept = np.diff(piece_from_s, prepend=-np.inf) > 0
+    kept |= np.isin(chain.keys, sorted(pinned))
     kept[-1] = True
     return np.asarray(kept)
 

@@ -52,14 +52,18 @@ class LeaderRecord:
 def leader_record(leader: LeaderCore, time_s: Array, window: Window) -> LeaderRecord:
     """Return what a leader holds."""
     vehicles = leader.vehicles()
-    seen = leader.observe(leader.reckoned.time_s)
+    seen, proposal = leader.observe(leader.reckoned.time_s), leader.propose()
     return LeaderRecord(
         trajectories={vehicle: leader.trajectory(vehicle) for vehicle in vehicles},
         covariances_m2={v: final_covariances(v, time_s, leader) for v in vehicles},
         closures=[closure_result(verdict) for verdict in leader.verdicts()],
         patches=sheet_patches(leader, window),
         quantities=[] if seen is None else [as_row(q) for q in seen.quantities],
-        remarks=[*([] if seen is None else seen.lines()), *seabed_remarks(leader.status())],
+        remarks=[
+            *([] if seen is None else seen.lines()),
+            *map(str, [proposal] if proposal else []),
+            *seabed_remarks(leader.status()),
+        ],
     )
 
 

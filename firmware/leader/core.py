@@ -32,8 +32,10 @@ from firmware.leader.fixes import Fixes
 from firmware.leader.fleet import Fleet
 from firmware.leader.judgement import Judgement
 from firmware.leader.ledger import Anchor
+from firmware.leader.manoeuvre import Proposal, propose
 from firmware.leader.matching import MatchOutcome
 from firmware.leader.observability import Observability, observe
+from firmware.leader.outlook import situation_of
 from firmware.leader.own_grid import grid_of
 from firmware.leader.pairing import Calibrations
 from firmware.leader.pose_graph import PoseGraph
@@ -332,6 +334,16 @@ class LeaderCore:
             )
             positions_m = [self.graph.trajectory(chain).position_m[-1] for chain in chains]
             return observe(now_s, names, np.array(positions_m), joint, reckoned)
+        except (EstimationError, np.linalg.LinAlgError):
+            return None
+
+    def propose(self) -> Proposal | None:
+        """Return the manoeuvre that would help most, if one would."""
+        s = self._settings
+        noise_m2 = s.matching.cell_sigma_m**2
+        try:
+            situation = situation_of(self.fleet, self.graph, self.atlas, s.manoeuvre, noise_m2)
+            return propose(situation, s.manoeuvre)
         except (EstimationError, np.linalg.LinAlgError):
             return None
 

@@ -428,6 +428,23 @@ class PoseGraph:
         except RuntimeError as error:
             raise EstimationError("the information matrix is singular") from error
 
+    def newest_with(self, vehicles: list[int], anchors: list[Anchor]) -> Array:
+        """Return the joint covariance of vehicles' newest states and of anchors' positions.
+
+        It is (4V + 2A, 4V + 2A). Raises EstimationError if the information matrix is singular.
+        """
+        self.update()
+        newest = [self._chains[vehicle].keys[-1] for vehicle in vehicles]
+        keys = list(dict.fromkeys([*newest, *(anchor.key for anchor in anchors)]))
+        try:
+            joint = self._isam.jointMarginalCovariance(keys).fullMatrix()
+        except RuntimeError as error:
+            raise EstimationError("the information matrix is singular") from error
+        first = dict(zip(keys, range(0, 4 * len(keys), 4), strict=True))
+        rows = [first[key] + k for key in newest for k in range(4)]
+        rows += [first[anchor.key] + axis for anchor in anchors for axis in (0, 1)]
+        return np.asarray(joint[np.ix_(rows, rows)])
+
     def chi_square(self, number: int) -> float:
         """Return the squared innovation of a closure in units of its covariance."""
         innovation_m = self.innovation(number)

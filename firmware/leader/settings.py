@@ -10,6 +10,7 @@ from firmware.leader.coverage import CoverageSettings
 from firmware.leader.fixes import FixSettings
 from firmware.leader.fleet import FleetSettings
 from firmware.leader.judgement import JudgementSettings
+from firmware.leader.manoeuvre import ManoeuvreSettings
 from firmware.leader.matching import MatchingSettings
 from firmware.leader.pose_graph import GraphSettings
 from firmware.leader.ranges import RangeSettings
@@ -40,6 +41,7 @@ class LeaderSettings(Settings):
     graph: GraphSettings = setting(GraphSettings, "", "the pose graph")
     composition: CompositionSettings = setting(CompositionSettings, "", "the graph's past")
     coverage: CoverageSettings = setting(CoverageSettings, "", "which sub-maps are matched with")
+    manoeuvre: ManoeuvreSettings = setting(ManoeuvreSettings, "", "what is proposed to do")
     fixes: FixSettings = setting(FixSettings, "", "GNSS and USBL")
     fleet: FleetSettings = setting(FleetSettings, "", "the followers' trajectories")
     answers: str = setting(

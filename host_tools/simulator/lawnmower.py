@@ -32,6 +32,27 @@ class Path:
     yaw_rad: Array
 
 
+class Turned:
+    """A path that is left at some instant for a straight line; the turn itself takes no time."""
+
+    def __init__(
+        self, path: "Lawnmower | Turned", from_s: float, heading_rad: float, speed_mps: float
+    ) -> None:
+        self._path, self._from_s, self._heading_rad = path, from_s, heading_rad
+        self._velocity_mps = speed_mps * np.array([np.cos(heading_rad), np.sin(heading_rad)])
+
+    def at(self, time_s: Array | float) -> Path:
+        """Return the path at the times (T,)."""
+        time_s = np.atleast_1d(np.asarray(time_s, dtype=np.float64))
+        before = self._path.at(np.minimum(time_s, self._from_s))
+        after_s = np.maximum(time_s - self._from_s, 0.0)
+        return Path(
+            north_m=before.north_m + after_s * self._velocity_mps[0],
+            east_m=before.east_m + after_s * self._velocity_mps[1],
+            yaw_rad=np.where(after_s > 0.0, self._heading_rad, before.yaw_rad),
+        )
+
+
 class Lawnmower:
     """The true horizontal path of one vehicle as a function of time.
 

@@ -9,7 +9,7 @@ import numpy as np
 from firmware.geometry import Array, wrap_angle
 from firmware.soundings import Fix, Odometry, Ping
 from host_tools.scenario import ScenarioSettings
-from host_tools.simulator.lawnmower import Lawnmower
+from host_tools.simulator.lawnmower import Lawnmower, Turned
 from host_tools.simulator.multibeam import Multibeam, Poses
 from host_tools.simulator.navigation import NavigationErrors
 from host_tools.simulator.seabed import Seabed
@@ -61,7 +61,9 @@ class SimulatedVehicle:
         self.index = index
         self._scenario = scenario
         self._survey_s = min(scenario.survey_s(index), scenario.duration_s)
-        self._path = Lawnmower(scenario, index, np.random.default_rng([seed, index, 0]))
+        self._path: Lawnmower | Turned = Lawnmower(
+            scenario, index, np.random.default_rng([seed, index, 0])
+        )
         self._errors = NavigationErrors(scenario, index, seed)
         self._attitude_rng = np.random.default_rng([seed, index, 2])
         self._sonar = Multibeam(
@@ -128,6 +130,15 @@ class SimulatedVehicle:
                         depth_m=depth_m,
                     ),
                 )
+
+    def steer(self, from_s: float, heading_rad: float | None = None) -> None:
+        """Leave the survey for a straight line: on, or at a heading.
+
+        It must lie beyond the chunk of CHUNK_S that was measured already.
+        """
+        if heading_rad is None:
+            heading_rad = float(self._path.at(from_s).yaw_rad[0])
+        self._path = Turned(self._path, from_s, heading_rad, self._scenario.speed_mps)
 
     def told_start(self) -> tuple[float, float, float]:
         """Return north, east, depth at which the vehicle is told that it begins."""

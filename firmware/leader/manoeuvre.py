@@ -1,0 +1,179 @@
+"""Which way to go so that the vehicles learn most of where they are.
+
+A candidate is one vehicle that keeps a heading for a while; all others go on as they do. Along it
+the joint covariance of the vehicles' newest states and of known ground is carried forward: it grows
+by dead reckoning, and shrinks by ranges, as their geometry will be, and by closures with the ground
+that will be crossed, as much as the relief there can tell. No measurement is needed for that, only
+where it will be made: the expected covariance of a linear filter (Davison and Murray, PAMI 2002,
+choose what to look at so).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from firmware.geometry import Array
+from firmware.leader.observability import STATE
+from protocol.settings import Settings, setting
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ManoeuvreSettings(Settings):
+    """How far one looks ahead, and what is expected there."""
+
+    horizon_s: float = setting(600.0, "s", "a manoeuvre that takes no longer", minimum=60.0)
+    step_s: float = setting(20.0, "s", "between predicted measurements", minimum=5.0)
+    headings: int = setting(16, "", "tried, all around", minimum=4, maximum=72)
+    reach_m: float = setting(
+        50.0, "m", "from a sub-map's middle, where tracks overlap", minimum=5.0
+    )
+    range_sigma_m: float = setting(2.0, "m", "of a predicted range", minimum=0.1)
+    closure_floor_m: float = setting(0.4, "m", "no closure tells more", minimum=0.01)
+    odometry_noise: float = setting(0.2, "m/sqrt(s)", "as in the graph", minimum=1e-4)
+    bias_walk: float = setting(0.002, "m/s/sqrt(s)", "of the drift that all share", minimum=1e-7)
+    bias_walk_apart: float = setting(0.0007, "m/s/sqrt(s)", "of each one's own", minimum=1e-7)
+    worth: float = setting(
+        0.8, "1", "of the uncertainty that going on leaves; else nothing is proposed", minimum=0.01
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ground:
+    """A sub-map that may be crossed: where, and what a match would tell (2, 2) in 1/m^2."""
+
+    position_m: Array
+    information: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Situation:
+    """Where V vehicles are and go, (V, 2) each, and the ground G that is known.
+
+    joint (4V + 2G, 4V + 2G) is the covariance of the newest states, then of the ground's positions.
+    """
+
+    names: tuple[str, ...]
+    positions_m: Array
+    velocities_mps: Array
+    ground: tuple[Ground, ...]
+    joint: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Proposal:
+    """A heading for one vehicle; sigmas are the root mean square over all vehicles' positions."""
+
+    vehicle: int  # its place among the situation's
+    name: str
+    heading_deg: float
+    minutes: float
+    sigma_m: float
+    otherwise_m: float
+
+    def __str__(self) -> str:
+        return (
+            f"proposed: {self.name} steers {self.heading_deg:03.0f} degrees for {self.minutes:.0f} "
+            f"minutes; positions would be known to {self.sigma_m:.1f} m instead of "
+            f"{self.otherwise_m:.1f} m"
+        )
+
+
+def propose(situation: Situation, settings: ManoeuvreSettings) -> Proposal | None:
+    """Return the candidate that leaves least uncertainty, or None if none is worth the way."""
+    otherwise_m = expected_m(situation, situation.velocities_mps, settings)
+    best: Proposal | None = None
+    for vehicle, name in enumerate(situation.names):
+        speed_mps = float(np.hypot(*situation.velocities_mps[vehicle]))
+        for heading_deg in np.arange(settings.headings) * 360.0 / settings.headings:
+            angle = np.radians(heading_deg)
+            velocities_mps = situation.velocities_mps.copy()
+            velocities_mps[vehicle] = speed_mps * np.array([np.cos(angle), np.sin(angle)])
+            sigma_m = expected_m(situation, velocities_mps, settings)
+            if sigma_m < (settings.worth * otherwise_m if best is None else best.sigma_m):
+                best = Proposal(
+                    vehicle=vehicle,
+                    name=name,
+                    heading_deg=float(heading_deg),
+                    minutes=settings.horizon_s / 60.0,
+                    sigma_m=sigma_m,
+                    otherwise_m=otherwise_m,
+                )
+    return best
+
+
+def expected_m(situation: Situation, velocities_mps: Array, settings: ManoeuvreSettings) -> float:
+    """Return the root mean square sigma of all positions after the horizon, each axis."""
+    vehicles, step_s = len(situation.names), settings.step_s
+    covariance, positions_m = situation.joint, situation.positions_m
+    forward, noise = _dead_reckoning(vehicles, len(covariance), settings)
+    met: set[tuple[int, int]] = set()
+    for _ in range(round(settings.horizon_s / step_s)):
+        positions_m = positions_m + velocities_mps * step_s
+        covariance = forward @ covariance @ forward.T + noise
+        for k in range(1, vehicles):
+            row, apart_m = np.zeros((1, len(covariance))), positions_m[k] - positions_m[0]
+            row[0, STATE * k : STATE * k + 2] = apart_m / max(float(np.hypot(*apart_m)), 1.0)
+            row[0, :2] = -row[0, STATE * k : STATE * k + 2]
+            covariance = _measured(covariance, row, np.array([[settings.range_sigma_m**-2]]))
+        for k in range(vehicles):
+            place = _crossed(situation, positions_m[k], settings)
+            if place is None or (k, place) in met:
+                continue
+            met.add((k, place))
+            rows = np.zeros((2, len(covariance)))
+            rows[:, STATE * k : STATE * k + 2] = np.eye(2)
+            at = STATE * vehicles + 2 * place
+            rows[:, at : at + 2] = -np.eye(2)
+            covariance = _measured(covariance, rows, situation.ground[place].information)
+    axes = np.concatenate([STATE * k + np.arange(2) for k in range(vehicles)])
+    return float(np.sqrt(np.mean(np.diag(covariance)[axes])))
+
+
+def relief_information(
+    depth_m: Array, cell_m: float, variance_m2: float, settings: ManoeuvreSettings
+) -> Array:
+    """Return what a match on half of a grid (R, C) would tell of a shift, (2, 2) in 1/m^2.
+
+    Each cell tells along its slope; a few dozen cells err together, and no match is better than
+    the floor.
+    """
+    north, east = np.gradient(depth_m, cell_m)
+    slopes = np.stack([north.ravel(), east.ravel()])
+    slopes = slopes[:, np.isfinite(slopes).all(axis=0)]
+    told = 0.5 * (slopes @ slopes.T) / (2.0 * variance_m2 * _ERR_TOGETHER)
+    values, axes = np.linalg.eigh(told)
+    values = 1.0 / (1.0 / np.maximum(values, 1e-9) + settings.closure_floor_m**2)
+    return np.asarray((axes * values) @ axes.T)
+
+
+_ERR_TOGETHER = 30.0  # cells, as in the calibration
+
+
+def _dead_reckoning(vehicles: int, size: int, s: ManoeuvreSettings) -> tuple[Array, Array]:
+    forward, noise = np.eye(size), np.zeros((size, size))
+    biases = [slice(STATE * k + 2, STATE * k + 4) for k in range(vehicles)]
+    for k, bias in enumerate(biases):
+        position = slice(STATE * k, STATE * k + 2)
+        forward[position, bias] = -s.step_s * np.eye(2)
+        noise[position, position] = s.odometry_noise**2 * s.step_s * np.eye(2)
+        for other in biases:
+            noise[bias, other] = s.bias_walk**2 * s.step_s * np.eye(2)
+        noise[bias, bias] += s.bias_walk_apart**2 * s.step_s * np.eye(2)
+    return forward, noise
+
+
+def _measured(covariance: Array, rows: Array, information: Array) -> Array:
+    """Return the covariance (N, N) after a measurement by rows (M, N) of some information."""
+    root = np.linalg.cholesky(information + 1e-12 * np.eye(len(information)))
+    whitened = root.T @ rows
+    cross = covariance @ whitened.T
+    gain = np.linalg.solve(whitened @ cross + np.eye(len(rows)), cross.T)
+    return np.asarray(covariance - cross @ gain)
+
+
+def _crossed(situation: Situation, position_m: Array, s: ManoeuvreSettings) -> int | None:
+    if not situation.ground:
+        return None
+    apart_m = np.hypot(*(np.array([g.position_m for g in situation.ground]) - position_m).T)
+    nearest = int(np.argmin(apart_m))
+    return nearest if apart_m[nearest] <= s.reach_m else None

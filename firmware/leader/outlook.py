@@ -1,0 +1,74 @@
+"""The situation as the leader sees it, for the proposal of a manoeuvre."""
+
+import numpy as np
+
+from firmware.geometry import Array
+from firmware.leader.atlas import Atlas, Sheet, name_of
+from firmware.leader.closures import corrections
+from firmware.leader.fleet import Fleet
+from firmware.leader.manoeuvre import Ground, ManoeuvreSettings, Situation, relief_information
+from firmware.leader.pose_graph import PoseGraph
+from firmware.submaps import GriddedSubmap
+
+MOST_GROUND = 32  # sub-maps whose joint covariance is asked for
+APART_M = 60.0  # nearer ones tell the same
+_VELOCITY_OVER_S = 20.0
+
+
+def situation_of(
+    fleet: Fleet, graph: PoseGraph, atlas: Atlas, settings: ManoeuvreSettings, noise_m2: float
+) -> Situation:
+    """Return where everyone is and what is known of the ground in reach.
+
+    Raises EstimationError if the graph can say nothing.
+    """
+    vehicles = fleet.vehicles()
+    chains = [fleet.newest_chain(vehicle) for vehicle in vehicles]
+    positions_m = np.array([graph.trajectory(chain).position_m[-1] for chain in chains])
+    velocities_mps = np.array([_velocity(fleet, graph, chain) for chain in chains])
+    reach_m = float(np.hypot(*velocities_mps.T).max()) * settings.horizon_s
+    sheets, places_m = _in_reach(list(atlas), graph, positions_m, reach_m)
+    anchors = [graph.anchor(s.id.chain, s.time_s, s.track) for s in sheets]
+    return Situation(
+        names=tuple(name_of(vehicle) for vehicle in vehicles),
+        positions_m=positions_m,
+        velocities_mps=velocities_mps,
+        ground=tuple(
+            Ground(
+                position_m=place_m,
+                information=_told(sheet.grid, noise_m2, settings),
+            )
+            for sheet, place_m in zip(sheets, places_m, strict=True)
+        ),
+        joint=graph.newest_with(chains, anchors),
+    )
+
+
+def _told(grid: GriddedSubmap, noise_m2: float, settings: ManoeuvreSettings) -> Array:
+    variance_m2 = float(np.nanmedian(grid.variance_m2)) + noise_m2
+    return relief_information(grid.depth_m, grid.cell_m, variance_m2, settings)
+
+
+def _velocity(fleet: Fleet, graph: PoseGraph, chain: int) -> Array:
+    track = fleet.track(chain)
+    end_s = float(track.time_s[-1])
+    ends_s = np.array([max(end_s - _VELOCITY_OVER_S, float(track.time_s[0])), end_s])
+    ends_m = graph.trajectory(chain).correct(ends_s, track.position_at(ends_s))
+    return np.asarray((ends_m[1] - ends_m[0]) / max(ends_s[1] - ends_s[0], 1.0))
+
+
+def _in_reach(
+    sheets: list[Sheet], graph: PoseGraph, positions_m: Array, reach_m: float
+) -> tuple[list[Sheet], list[Array]]:
+    """Return sub-maps in reach of a vehicle and where they lie, the oldest of each place."""
+    chosen: list[Sheet] = []
+    places_m: list[Array] = []
+    moves_m = corrections(sheets, graph)
+    for sheet, move_m in sorted(zip(sheets, moves_m, strict=True), key=lambda s: s[0].time_s):
+        place_m = sheet.centre_m + move_m
+        near_m = np.hypot(*(positions_m - place_m).T).min()
+        apart_m = np.hypot(*(np.array(places_m) - place_m).T).min() if places_m else np.inf
+        if near_m <= reach_m and apart_m >= APART_M and len(chosen) < MOST_GROUND:
+            chosen.append(sheet)
+            places_m.append(place_m)
+    return chosen, places_m

@@ -8,7 +8,8 @@ from firmware.compression.kernels import Hyperparameters
 from firmware.geometry import Array
 from firmware.submaps import BinnedSoundings
 
-_ROWS = 4096  # residuals looked at: a hundred would do for two numbers, these cost 4 ms
+_MOST_ROWS = 4096  # residuals looked at: a hundred would do for two numbers
+_ROW_WORK = 4096 * 150**2  # rows x points^2: 4 ms
 _TAIL = 30.0  # times the median: four sigma of a Gaussian
 _GROUPS = 8  # of cells by density, nadir to outer beams
 _SMALLEST_M2 = 1e-6
@@ -23,7 +24,8 @@ def calibrated(
     E[e^2] = c v + sigma^2, with v the posterior variance for c = 1. Both are found by weighted
     least squares, weights 1 / E^2, neither below zero.
     """
-    every = max(1, -(-bins.depth_m.size // _ROWS))
+    rows = max(512, min(_MOST_ROWS, _ROW_WORK // max(len(points_ned_m), 1) ** 2))
+    every = max(1, -(-bins.depth_m.size // rows))
     unit = Hyperparameters(
         b_per_m=hyper.b_per_m,
         c_m2=1.0,

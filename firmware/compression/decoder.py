@@ -8,14 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import LinAlgError, cho_solve, lapack
+from scipy.linalg import cho_solve, lapack
 
 from firmware.compression.kernels import Hyperparameters, correlation, squared_distance
 from firmware.geometry import Array
 from protocol.errors import EstimationError
 
 NUGGET = 1e-4  # of c: the least that keeps 150 points solvable; sigma^2 would smooth twice
-_ROWS = 1024  # kernel rows held at once: 3 MB for 150 points, and they stay in the cache
+_ROW_POINTS = 512 * 150  # of kernel rows held at once: 1 MB, and they stay in the cache
 _TRIES = 6  # the nugget grows tenfold each time, up to 10 c
 
 
@@ -36,13 +36,16 @@ class PointDecoder:
         depth_m = np.empty(len(position_m))
         variance_m2 = np.empty(len(position_m))
         c, sigma2 = self.hyper.c_m2, self.hyper.sigma2_m2
-        for start in range(0, len(position_m), _ROWS):
-            part = slice(start, start + _ROWS)
+        rows = max(64, _ROW_POINTS // len(self.points_m))
+        squared, spare = np.empty((2, rows, len(self.points_m)), dtype=np.float32)
+        for start in range(0, len(position_m), rows):
+            part = slice(start, start + rows)
             local_m = (position_m[part] - self.origin_m).astype(np.float32)
-            squared = squared_distance(local_m, self.points_m, self.hyper.b_per_m)
-            k = correlation(self.hyper.kernel, squared)
+            room, more = squared[: len(local_m)], spare[: len(local_m)]
+            squared_distance(local_m, self.points_m, self.hyper.b_per_m, room, more)
+            k = correlation(self.hyper.kernel, room, more)
             depth_m[part] = k @ self.weights_m
-            white = k @ self.whitener
+            white = np.matmul(k, self.whitener, out=room)
             explained = np.einsum("ij,ij->i", white, white)
             variance_m2[part] = np.clip(1.0 - explained, 0.0, 1.0)
         return depth_m + self.hyper.mean_depth_m, c * variance_m2 + sigma2
@@ -59,16 +62,17 @@ def point_decoder(points_ned_m: Array, hyper: Hyperparameters) -> PointDecoder:
     points_ned_m = np.asarray(points_ned_m, dtype=np.float64)
     origin_m = points_ned_m[:, :2].mean(axis=0)
     local_m = points_ned_m[:, :2] - origin_m
-    k = correlation(hyper.kernel, squared_distance(local_m, local_m, hyper.b_per_m))
     nugget = NUGGET + (hyper.sigma2_m2 / hyper.c_m2 if hyper.noise_applied else 0.0)
-    lower, nugget, failed = factorised(np.asarray(k, dtype=np.float64), nugget)
-    weights_m = cho_solve((lower, True), points_ned_m[:, 2] - hyper.mean_depth_m)
-    inverse = lapack.dtrtri(lower, lower=1)[0]
+    k = correlation(hyper.kernel, squared_distance(local_m, local_m, hyper.b_per_m))
+    lower, nugget, failed = factorised(k, nugget)
+    del k
+    weights_m = cho_solve((lower.T, False), points_ned_m[:, 2] - hyper.mean_depth_m)
+    whitener = lapack.dtrtri(lower.T, lower=0, overwrite_c=1)[0]
     return PointDecoder(
         points_m=local_m.astype(np.float32),
         origin_m=origin_m,
         weights_m=weights_m.astype(np.float32),
-        whitener=np.ascontiguousarray(inverse.T, dtype=np.float32),
+        whitener=np.ascontiguousarray(whitener, dtype=np.float32),
         hyper=hyper,
         nugget=nugget,
         failed_factorisations=failed,
@@ -76,12 +80,15 @@ def point_decoder(points_ned_m: Array, hyper: Hyperparameters) -> PointDecoder:
 
 
 def factorised(k: Array, nugget: float) -> tuple[Array, float, int]:
-    """Return the lower Cholesky factor of k + nugget I, the nugget it took, and the failures."""
+    """Return the lower Cholesky factor of k + nugget I, the nugget it took, and the failures.
+
+    The factor is in the order of rows, so that LAPACK takes its transpose as it is.
+    """
     for failed in range(_TRIES):
-        try:
-            lower = np.asarray(np.linalg.cholesky(k + nugget * np.eye(len(k))), dtype=np.float64)
-        except (LinAlgError, np.linalg.LinAlgError):
-            nugget *= 10.0
-            continue
-        return lower, nugget, failed
+        widened = np.array(k, dtype=np.float64)
+        widened[np.diag_indices_from(widened)] += nugget
+        upper, info = lapack.dpotrf(widened.T, lower=0, overwrite_a=1)  # in place, seen as columns
+        if info == 0 and np.isfinite(upper[-1, -1]):
+            return upper.T, nugget, failed
+        nugget *= 10.0
     raise EstimationError(f"covariance of {len(k)} points stays singular at a nugget of {nugget} c")

@@ -21,14 +21,16 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_solve, solve_triangular
 
 from firmware.compression.decoder import NUGGET, factorised
+from firmware.compression.kernel_rows import Room, Rows
 from firmware.compression.kernels import Kernel, correlation_and_slope, squared_distance
 from firmware.compression.losses import LossPatterns
 from firmware.geometry import Array
 
-_ROW_WORK = 1024 * 150**2  # rows x points^2 of a step: under 10 ms
+_STEP_WORK = 10240 * 150**2  # rows x points^2 of a step: under 10 ms
+_ROOM_ROWS = 192 * 150  # rows x points held at once: they stay in the cache
+_KEPT_BYTES = 4 << 20  # of kernel rows between two passes; beyond it they are made twice
 _ROUNDING = 1e-14  # of a Gram matrix in double precision
 
-Float32 = NDArray[np.float32]
 T = TypeVar("T")
 
 
@@ -54,18 +56,23 @@ class ExpectedError:
         patterns: LossPatterns,
         fragment: NDArray[np.intp],
         ridge: float,
+        keep_rows: bool = True,
     ) -> None:
         weight = weight / weight.sum()
         self.total_m2 = float(np.dot(weight, depth_m**2))
         points = len(fragment)
-        height = max(128, _ROW_WORK // points**2)
-        room = np.empty((3, len(depth_m), points), dtype=np.float32)
-        weighted = np.empty((min(height, len(depth_m)), points))
-        spare = np.empty(weighted.shape, dtype=np.float32)
-        parts = [slice(start, start + height) for start in range(0, len(depth_m), height)]
+        height = max(64, _ROOM_ROWS // points)
+        self._rows_a_step = max(1, _STEP_WORK // (height * points**2))
+        self._kept = keep_rows and 8 * len(depth_m) * points <= _KEPT_BYTES
+        room = Room.of(min(height, len(depth_m)), points)
         self._rows = [
-            _Rows(position_m[part], depth_m[part], weight[part], room[:, part], weighted, spare)
-            for part in parts
+            Rows(
+                position_m[start : start + height],
+                depth_m[start : start + height],
+                weight[start : start + height],
+                room.with_own_rows() if self._kept else room,
+            )
+            for start in range(0, len(depth_m), height)
         ]
         self._kernel = kernel
         self._no_loss = patterns.no_loss
@@ -92,11 +99,12 @@ class ExpectedError:
         b = float(np.exp(log_b))
         points = point_m.astype(np.float32)
         gram, moment = np.zeros((len(points), len(points))), np.zeros(len(points))
-        for rows in self._rows:
+        for done, rows in enumerate(self._rows, 1):
             rows.measure(self._kernel, points, b)
             gram += rows.weighted.T @ rows.weighted
             moment += rows.weighted.T @ rows.target
-            yield
+            if done % self._rows_a_step == 0:
+                yield
         inner = yield from self._solved_steps(point_m, b, gram, moment)
         if not gradient:
             return inner.evaluation
@@ -104,11 +112,14 @@ class ExpectedError:
         by_position, by_log_b = inner.evaluation.by_position, inner.evaluation.by_log_b
         stack = inner.stack.astype(np.float32)
         low_rank = (2.0 * inner.stack * inner.probability).astype(np.float32).T
-        for rows in self._rows:
+        for done, rows in enumerate(self._rows, 1):
+            if not self._kept:
+                rows.measure(self._kernel, points, b)
             by_point, by_scale = rows.pulled(stack, low_rank, points)
             by_position += (b * b) * by_point
-            by_log_b -= by_scale
-            yield
+            by_log_b -= (b * b) * by_scale
+            if done % self._rows_a_step == 0:
+                yield
         return dataclasses.replace(inner.evaluation, by_position=by_position, by_log_b=by_log_b)
 
     def _solved_steps(
@@ -116,43 +127,55 @@ class ExpectedError:
     ) -> Generator[None, None, "_Inner"]:
         """Return the best weights, their error, and the gradient through the points' own K."""
         squared = squared_distance(point_m, point_m, b)
-        k, slope = correlation_and_slope(self._kernel, squared)
-        lower, nugget, failed = factorised(np.array(k), NUGGET)
-        self.failed_factorisations += failed
-        k = k + nugget * np.eye(len(point_m))
-        yield
+        k, slope = correlation_and_slope(self._kernel, squared, squared)
+        if slope is k:  # which is changed below
+            slope = k.copy()
         if self._groups:
-            beta, stack, by_k = yield from self._weights_under_losses(gram, moment, lower)
+            found = yield from self._under_losses(gram, moment, k)
+            by_k = np.add(found.by_k, found.by_k.T)
+            by_k *= slope
         else:
-            beta = self._weights_without_loss(gram, moment, k)
-            stack, by_k = beta[:, None], np.zeros_like(k)
-        probability = np.concatenate([[self._no_loss], *(p for _, p in self._groups)])
-        error = self.total_m2 + self._ridge * float(beta @ k @ beta)
-        fitted = np.einsum("mp,mp->p", stack, gram @ stack)
-        error += float(probability @ (fitted - 2.0 * moment @ stack))
-        by_k += self._ridge * np.outer(beta, beta)
-        by_k = (by_k + by_k.T) * slope
+            yield
+            found = self._without_losses(gram, moment, k)
+            by_k = slope
+            by_k *= (2.0 * self._ridge) * found.beta
+            by_k *= found.beta[:, None]
+        beta, mass, moved = found.beta, by_k.sum(axis=1), by_k @ point_m
+        by_scale = mass @ np.sum(point_m**2, axis=1) - float(np.vdot(moved, point_m))
         evaluation = Evaluation(
-            error_m2=error,
-            by_position=(b * b) * (by_k @ point_m - by_k.sum(axis=1)[:, None] * point_m),
-            by_log_b=-0.5 * float(np.sum(by_k * squared)),
+            error_m2=found.error_m2,
+            by_position=(b * b) * (moved - mass[:, None] * point_m),
+            by_log_b=-(b * b) * float(by_scale),
             depth_m=k @ beta,
         )
-        return _Inner(evaluation=evaluation, stack=stack, probability=probability)
+        return _Inner(evaluation=evaluation, stack=found.stack, probability=found.probability)
 
-    def _weights_without_loss(self, gram: Array, moment: Array, k: Array) -> Array:
-        """Return the beta of least error when every point arrives."""
-        lower, _, failed = factorised(gram + self._ridge * k, _ROUNDING * float(np.trace(gram)))
+    def _without_losses(self, gram: Array, moment: Array, k: Array) -> "_Solution":
+        """Return the beta of least error when every point arrives; gram and k are used up."""
+        k[np.diag_indices_from(k)] += NUGGET
+        k *= self._ridge
+        gram += k
+        k /= self._ridge
+        lower, _, failed = factorised(gram, _ROUNDING * float(np.trace(gram)))
         self.failed_factorisations += failed
-        return np.asarray(cho_solve((lower, True), moment))
+        beta = np.asarray(cho_solve((lower.T, False), moment))
+        return _Solution(
+            beta=beta,
+            stack=beta[:, None],
+            probability=np.ones(1),
+            error_m2=self.total_m2 - float(moment @ beta),
+        )
 
-    def _weights_under_losses(
-        self, gram: Array, moment: Array, lower: Array
-    ) -> Generator[None, None, tuple[Array, Array, Array]]:
-        """Return the best beta, the weights under each pattern (M, P), and the error's by_k.
+    def _under_losses(
+        self, gram: Array, moment: Array, k: Array
+    ) -> Generator[None, None, "_Solution"]:
+        """Return the beta of least expected error; k gets its nugget.
 
         The points' own K enters through Q, that is through the corrections of the weights.
         """
+        lower, nugget, failed = factorised(k, NUGGET)
+        self.failed_factorisations += failed
+        k[np.diag_indices_from(k)] += nugget
         inverse = cho_solve((lower, True), np.eye(len(moment)))
         yield
         blocks = [_Block.of(group, inverse) for group in self._groups]
@@ -162,14 +185,18 @@ class ExpectedError:
         lost = [np.zeros((len(beta), 1)), *(block.weights_lost(beta) for block in blocks)]
         correction = inverse @ np.hstack(lost)
         stack = beta[:, None] - correction
-        pull = 2.0 * probability * (gram @ stack - moment[:, None])
+        fitted = gram @ stack
+        error = self.total_m2 + self._ridge * float(beta @ k @ beta)
+        error += float(probability @ (np.einsum("mp,mp->p", stack, fitted) - 2.0 * moment @ stack))
+        pull = 2.0 * probability * (fitted - moment[:, None])
         spread = inverse @ pull
         first = 1
         for block in blocks:
             columns = slice(first, first + len(block.probability))
             pull[:, columns] -= block.padded(block.solved(spread[:, columns]))
             first += len(block.probability)
-        return beta, stack, (inverse @ pull) @ correction.T
+        by_k = (inverse @ pull) @ correction.T + self._ridge * np.outer(beta, beta)
+        return _Solution(beta=beta, stack=stack, probability=probability, error_m2=error, by_k=by_k)
 
     def _best_weights(
         self, gram: Array, moment: Array, inverse: Array, lower: Array, blocks: "list[_Block]"
@@ -196,42 +223,15 @@ class ExpectedError:
         return beta
 
 
-class _Rows:
-    """Some cells, and their kernel rows (R, M) kept between the two passes."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Solution:
+    """The best weights (M,), those under each pattern (M, P), the error, and its change by K."""
 
-    def __init__(
-        self,
-        position_m: Array,
-        depth_m: Array,
-        weight: Array,
-        room: Float32,
-        weighted: Array,
-        spare: Float32,
-    ) -> None:
-        self._position_m = position_m.astype(np.float32)
-        self._depth_m = depth_m[:, None].astype(np.float32)
-        self._weight = weight[:, None].astype(np.float32)
-        self._root = np.sqrt(weight)
-        self._squared, self._k, self._slope = room
-        self.weighted = weighted[: len(depth_m)]  # shared by all rows, for the pass that fills it
-        self._spare = spare[: len(depth_m)]  # likewise
-        self.target = self._root * depth_m
-
-    def measure(self, kernel: Kernel, points: Float32, b: float) -> None:
-        """Fill the rows for these points; float32 sums would lose what beta lives on."""
-        squared_distance(self._position_m, points, b, self._squared, self._spare)
-        self._k, self._slope = correlation_and_slope(kernel, self._squared, self._k, self._slope)
-        np.multiply(self._k, self._root[:, None], out=self.weighted)
-
-    def pulled(self, stack: Float32, low_rank: Float32, points: Float32) -> tuple[Array, float]:
-        """Return the error's change by points (M, 2), over b^2, and by -log b."""
-        misfit = self._k @ stack
-        misfit -= self._depth_m
-        misfit *= self._weight
-        pull = np.matmul(misfit, low_rank, out=self._spare)
-        pull *= self._slope
-        by_point = pull.T @ self._position_m - pull.sum(axis=0)[:, None] * points
-        return by_point.astype(np.float64), float(np.vdot(pull, self._squared))
+    beta: Array
+    stack: Array
+    probability: Array
+    error_m2: float
+    by_k: Array = dataclasses.field(default_factory=lambda: np.empty((0, 0)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -25,9 +25,9 @@ class Kernel(enum.IntEnum):
     EXPONENTIAL = 2  # exp(-s / 2)
 
 
-def correlation(kernel: Kernel, squared: FloatArray) -> FloatArray:
-    """Return the correlation at squared scaled distances, in their precision; squared is kept."""
-    return correlation_and_slope(kernel, squared)[0]
+def correlation(kernel: Kernel, squared: FloatArray, spare: FloatArray | None = None) -> FloatArray:
+    """Return the correlation at squared scaled distances, which are used up, in their precision."""
+    return correlation_and_slope(kernel, squared, squared, spare)[0]
 
 
 def correlation_and_slope(
@@ -40,7 +40,7 @@ def correlation_and_slope(
 
     With s = b d, dk/dz = slope b^2 (x - z) for a point z, and dk/d(log b) = -slope s^2. The slope
     of the exponential kernel is singular at zero distance and is held there. Room for both may be
-    given: fresh pages cost as much as the arithmetic.
+    given, also `squared` itself: fresh pages cost as much as the arithmetic.
     """
     floor = squared.dtype.type(_EXPONENT_FLOOR)
     if kernel is Kernel.SQUARED_EXPONENTIAL:

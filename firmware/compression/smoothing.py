@@ -14,6 +14,8 @@ from firmware.compression.field import fitted_field_steps, fitted_trend
 from firmware.compression.lattice_frame import lattice_frame
 from firmware.submaps import BinnedSoundings
 
+_CHUNK = 2048  # cells read at once: 1 MB of interpolation
+
 
 def smoothed_steps(bins: BinnedSoundings, step_m: float) -> Generator[None, None, BinnedSoundings]:
     """Estimate the field on nodes every step_m; the value is the cells with its depths.
@@ -25,5 +27,9 @@ def smoothed_steps(bins: BinnedSoundings, step_m: float) -> Generator[None, None
     if frame.step_m > 1.5 * step_m:
         return bins
     field = yield from fitted_field_steps(cells, frame, fitted_trend(cells, frame))
-    position_m = np.column_stack([bins.north_m, bins.east_m])
-    return dataclasses.replace(bins, depth_m=field.depth_m(position_m))
+    depth_m = np.empty_like(bins.depth_m)
+    for start in range(0, depth_m.size, _CHUNK):
+        part = slice(start, start + _CHUNK)
+        depth_m[part] = field.depth_m(np.column_stack([bins.north_m[part], bins.east_m[part]]))
+        yield
+    return dataclasses.replace(bins, depth_m=depth_m)

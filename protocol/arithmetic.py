@@ -7,6 +7,7 @@ taken, `CodeEnd` is raised instead.
 """
 
 from collections.abc import Iterable
+from copy import copy
 
 _TOP = 1 << 24
 _ALL = 0xFFFFFFFF
@@ -51,6 +52,12 @@ class Encoder:
     def __len__(self) -> int:
         """Return about how many bytes were coded so far."""
         return len(self._out) + self._pending + 1
+
+    def copied(self) -> "Encoder":
+        """Return a coder that goes on from here by itself."""
+        out = copy(self)
+        out._out = self._out[:]  # noqa: SLF001  one of us
+        return out
 
     def encode(self, bit: int, share: int) -> None:
         """Code a bit whose probability of being one is share / 65536."""

@@ -102,7 +102,11 @@ def dealt_evenly(fragments: int, settings: CompressionSettings) -> Dealer:
 
 
 def fit_steps(
-    frame: FitFrame, count: int, settings: CompressionSettings, deal: Dealer
+    frame: FitFrame,
+    count: int,
+    settings: CompressionSettings,
+    deal: Dealer,
+    iterations: int | None = None,
 ) -> Generator[FittedPoints | None, None, str]:
     """Yield ever better fits, and None between small steps; the value says why it ended."""
     start_m, held = yield from initial_point_steps(frame.position_m, frame.depth_m, count)
@@ -152,7 +156,11 @@ def fit_steps(
 
     x0 = np.append(np.zeros(2 * (len(start_m) - held)), log_b)
     steps = minimise_steps(
-        objective, x0, evaluations=max(settings.iterations, 1), first_move=0.2, largest_move=0.5
+        objective,
+        x0,
+        evaluations=max(iterations or settings.iterations, 1),
+        first_move=0.2,
+        largest_move=0.5,
     )
     while True:
         try:
@@ -174,6 +182,7 @@ def moved_steps(
         fitted.patterns,
         fitted.fragment,
         frame.ridge,
+        keep_rows=False,
     )
     log_b = float(np.log(fitted.b_per_m))
     result = yield from problem.steps(position_m, log_b, gradient=False)

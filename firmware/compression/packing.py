@@ -57,7 +57,7 @@ def _bodies(compressed: CompressedCode, track: bytes) -> list[bytes]:
     size, frames = BODY_BYTES[compressed.profile], compressed.fragment_count
     settings = compressed.settings
     if isinstance(compressed.code, DenseCode):
-        return dense_bodies(compressed.code, track, size, frames, settings.expected_loss)
+        return dense_bodies(compressed.code, track, size, frames)
     return lattice_bodies(compressed.code, track, size, frames, settings)
 
 

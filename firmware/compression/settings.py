@@ -61,7 +61,14 @@ class CompressionSettings(Settings):
         40, "evaluations", "0.15 s of one core; the error is then within 5 % of settled", minimum=0
     )
     dense_iterations: int = setting(
-        12, "evaluations", "of `dense`, each four times dearer than one of `paper`", minimum=0
+        24, "evaluations", "of `dense`, each ten times dearer than one of `paper`", minimum=0
+    )
+    dense_points: int = setting(
+        450,
+        "points",
+        "of `dense`, three times the paper's; more gain little and cost memory",
+        minimum=3,
+        maximum=600,
     )
     frames: int = setting(
         10, "frames", "a sub-map of `dense` or `lattice`; `paper` has ten", minimum=1, maximum=15

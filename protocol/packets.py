@@ -1,6 +1,7 @@
 """What the vehicles tell each other: one frozen dataclass per packet; WIRE.md has the bytes."""
 
 import enum
+import math
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
@@ -18,6 +19,10 @@ FARTHEST_M = 1.0e6
 """A coordinate beyond this from the mission datum is damage or malice, never a survey."""
 HIGHEST_M, DEEPEST_M = -100.0, 12_000.0
 """Depths outside are absurd: positive down, the deepest trench is 10,935 m."""
+
+
+SMALLEST_SIGMA_M, SIGMA_STEPS = 0.1, 16
+"""An answer tells its sigma in sixteenths of an octave above 0.1 m."""
 
 
 class Profile(enum.IntEnum):
@@ -107,8 +112,9 @@ class Header:
 
     In fragments of a sub-map, submap, fragment (from 0) and fragment_count say which part of what
     this is, and time_quarters is the time of the slice's first state. In a trajectory packet,
-    submap counts such packets and fragment_count is 1. In an answer, submap counts answers,
-    fragment is the vehicle addressed and fragment_count the boot epoch of the sub-map answered.
+    submap counts such packets and fragment_count is 1. In an answer, submap holds the code of its
+    sigma and a count (see `answer_count`), fragment is the vehicle addressed and fragment_count the
+    boot epoch of the sub-map answered.
     """
 
     profile: Profile
@@ -224,7 +230,8 @@ class Answer:
     """The leader's estimate of a follower's position at the header's time.
 
     `submap` is the sub-map answered; the header's fragment is the vehicle addressed and its
-    fragment_count the boot epoch in which that vehicle numbered the sub-map.
+    fragment_count the boot epoch in which that vehicle numbered the sub-map. The header's submap
+    is `answer_count` of the sigma and of how many answers were sent before.
     """
 
     SIZE_BYTES: ClassVar[int] = 22
@@ -243,6 +250,21 @@ class Answer:
     def to_boot_epoch(self) -> int:
         """The boot epoch of that vehicle in which it numbered the sub-map."""
         return self.header.fragment_count
+
+    @property
+    def sigma_m(self) -> float | None:
+        """The standard deviation of the position along each axis; None if it is not told."""
+        code = self.header.submap >> 8
+        return SMALLEST_SIGMA_M * 2.0 ** ((code - 1) / SIGMA_STEPS) if code else None
+
+
+def answer_count(sigma_m: float, sent: int) -> int:
+    """Return the header's submap of an answer: sigma in the high byte, a count in the low one.
+
+    The sigma is rounded up to the next of 255 steps of 4 % between 0.1 m and 6 km.
+    """
+    steps = SIGMA_STEPS * math.log2(max(sigma_m, SMALLEST_SIGMA_M) / SMALLEST_SIGMA_M)
+    return (min(1 + math.ceil(steps - 1e-9), 255) << 8) | (sent % 256)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

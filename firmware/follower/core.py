@@ -251,10 +251,12 @@ class FollowerCore:
 
     def _receive_answer(self, answer: Answer | ExtendedAnswer, now_s: float) -> None:
         """Learn from the leader's estimate of a past state; queue what it asks for."""
-        sigma_m = None
+        sigma_m: float | None
         if isinstance(answer, ExtendedAnswer):
             self._outbox.request(answer.repeat_submap, answer.missing_fragments, now_s)
             sigma_m = float(np.sqrt(answer.variance_m2)) if answer.variance_m2 > 0 else np.nan
+        else:
+            sigma_m = answer.sigma_m
         time_s = from_quarters(answer.header.time_quarters, now_s)
         track = self._known_track()
         if not track.time_s[0] <= time_s <= now_s:

@@ -20,7 +20,7 @@ class DriftSettings(Settings):
     start_sigma_m: float = setting(0.5, "m", "uncertainty of the start", minimum=1e-3)
     odometry_noise: float = setting(0.2, "m/sqrt(s)", "random part of dead reckoning", minimum=1e-4)
     bias_sigma_mps: float = setting(0.15, "m/s", "unmeasured current at the start", minimum=1e-4)
-    bias_walk: float = setting(0.002, "m/s/sqrt(s)", "how the current wanders", minimum=1e-7)
+    bias_walk: float = setting(0.004, "m/s/sqrt(s)", "how the current wanders", minimum=1e-7)
     answers_alike_s: float = setting(
         150.0, "s", "errors of answers are alike for half a survey line, between closures",
         minimum=1.0,

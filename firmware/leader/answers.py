@@ -10,7 +10,7 @@ from firmware.leader.atlas import LEADER
 from firmware.leader.fleet import Fleet
 from firmware.leader.pose_graph import PoseGraph
 from protocol.errors import EstimationError
-from protocol.packets import Answer, ExtendedAnswer, Header, Profile
+from protocol.packets import Answer, ExtendedAnswer, Header, Profile, answer_count
 from protocol.reassembly import Reassembler
 from protocol.timestamps import to_quarters, to_tx_second
 
@@ -68,11 +68,13 @@ class Answers:
         self._fleet.extend(known.chain)
         anchor = self._graph.anchor(known.chain, known.time_s, self._fleet.track(known.chain))
         position_m = self._graph.position(anchor)
+        variance_m2 = float(np.trace(self._graph.covariance([anchor])) / 2)
+        count = answer_count(float(np.sqrt(max(variance_m2, 0.0))), self._sent)
         header = Header(
             profile=Profile.ANSWER_EXTENDED if self._extended else Profile.ANSWER,
             vehicle=LEADER,
             boot_epoch=self._boot_epoch,
-            submap=self._sent,
+            submap=self._sent if self._extended else count,
             fragment=vehicle,
             fragment_count=known.boot_epoch,
             tx_second=to_tx_second(round(now_s)),
@@ -91,7 +93,7 @@ class Answers:
             submap=known.submap,
             north_m=_float32(position_m[0]),
             east_m=_float32(position_m[1]),
-            variance_m2=_float32(np.trace(self._graph.covariance([anchor])) / 2),
+            variance_m2=_float32(variance_m2),
             leader_north_m=_float32(own.position_m[0]),
             leader_east_m=_float32(own.position_m[1]),
             leader_variance_m2=_float32(np.trace(own.covariance_m2) / 2),

@@ -73,7 +73,7 @@ class GraphSettings(Settings):
         0.2, "m/s", "vehicles drift in the same water: their biases differ by less", minimum=1e-4
     )
     bias_walk: float = setting(
-        0.002, "m/s/sqrt(s)", "lets a current of 0.2 m/s turn within an hour", minimum=1e-7
+        0.004, "m/s/sqrt(s)", "lets a current of 0.2 m/s turn within an hour", minimum=1e-7
     )
     bias_walk_apart: float = setting(
         0.0007, "m/s/sqrt(s)", "a current turns for all vehicles in it alike, nearly", minimum=1e-7
@@ -86,7 +86,7 @@ class GraphSettings(Settings):
     )
     log_scale_sigma: float = setting(0.005, "1", "scale error of the Doppler log", minimum=1e-9)
     range_sigma_m: float = setting(
-        2.0, "m", "noise of a range (1 m, Eq. 13) and of the way to its key frames", minimum=1e-3
+        1.2, "m", "noise of a range (1 m, Eq. 13) and of the way to its key frames", minimum=1e-3
     )
     closure_floor_m: float = setting(
         0.4, "m", "strain within a sub-map that no match can see", minimum=0.0

@@ -20,6 +20,7 @@ from protocol.packets import (
     SubmapFragment,
     SubmapPacket,
     TrajectoryPacket,
+    answer_count,
 )
 from protocol.schedule import Slots
 from tests.leader.vessels import follower_of, line, sail, slots_of
@@ -170,6 +171,16 @@ def test_told_variance_is_used() -> None:
     for variance_m2 in (1.0, 100.0):
         core = surveyed()
         frame = extended_of(answer_of(90.0, 185.0, 3.0), variance_m2=variance_m2)
+        core.receive_frame(frame, None, 100.0)
+        spreads_m2.append(core.belief().covariance_m2[0, 0])
+    assert spreads_m2[0] < spreads_m2[1]
+
+
+def test_sigma_in_a_plain_answer_is_used() -> None:
+    spreads_m2 = []
+    for sigma_m in (1.0, 10.0):
+        core = surveyed()
+        frame = answer_of(90.0, 185.0, 3.0, submap=answer_count(sigma_m, 1))
         core.receive_frame(frame, None, 100.0)
         spreads_m2.append(core.belief().covariance_m2[0, 0])
     assert spreads_m2[0] < spreads_m2[1]

@@ -21,6 +21,7 @@ from protocol.packets import (
     SealedFrame,
     SubmapPacket,
     TrajectoryPacket,
+    answer_count,
 )
 from tests.protocol.strategies import packets, paper_packet
 
@@ -224,3 +225,27 @@ def test_answers_name_their_vehicle_and_its_epoch(packet: Packet) -> None:
     assert isinstance(packet, Answer | ExtendedAnswer)
     assert packet.to_vehicle == packet.header.fragment
     assert packet.to_boot_epoch == packet.header.fragment_count
+
+
+@pytest.mark.parametrize("sigma_m", [0.0, 0.1, 0.37, 4.0, 250.0, 1e9])
+def test_answer_tells_its_sigma_rounded_up_by_four_percent_at_most(sigma_m: float) -> None:
+    header = replace(_answer_header(), submap=answer_count(sigma_m, 7_777))
+    answer = decode(encode(Answer(header=header, submap=1, north_m=0.0, east_m=0.0)))
+    assert isinstance(answer, Answer)
+    told_m = answer.sigma_m
+    assert told_m is not None
+    held_m = min(max(sigma_m, 0.1), 5_800.0)
+    assert held_m * 0.999 <= told_m <= held_m * 1.05
+    assert answer.header.submap % 256 == 7_777 % 256
+
+
+def test_answer_without_a_code_tells_no_sigma() -> None:
+    answer = Answer(header=_answer_header(), submap=1, north_m=0.0, east_m=0.0)
+    assert answer.sigma_m is None
+
+
+def _answer_header() -> Header:
+    return Header(
+        profile=Profile.ANSWER, vehicle=0, boot_epoch=0, submap=0, fragment=1, fragment_count=0,
+        tx_second=0, time_quarters=0,
+    )  # fmt: skip

@@ -50,7 +50,7 @@ _PLAIN = ("_settings", "_chains", "_ledger", "_entered", "_factorization", "rebu
 _WORN = 1.3
 """ISAM2 eliminates the newest variables last, and fills: so much of that, and it is built anew."""
 
-_SETTLING_STEPS = 4  # a robust weight follows its residual one step late
+_SETTLING_STEPS = 2  # a robust weight follows its residual one step late
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -46,7 +46,13 @@ class Ranging:
         self._bent: dict[int, deque[list[_HeldRange]]] = {}
 
     def hold(self, chain: int, header: Header, toa_s: float) -> None:
-        """Keep the range that a frame's arrival tells, until its sender's track is known."""
+        """Keep the range that a frame's arrival tells, until its sender's track is known.
+
+        Frames of one packet arrive as one: their range is one measurement, not several.
+        """
+        if any(r.chain == chain and r.arrived_s == toa_s for r in self._held):
+            self.counters["ranges_of_one_packet"] += 1
+            return
         if len(self._held) == self._held.maxlen:
             self.counters["ranges_overwritten"] += 1
         sent_s = transmission_s(header.tx_second, toa_s)

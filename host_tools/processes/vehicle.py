@@ -79,7 +79,10 @@ def run_vehicle(
         prepare_store(store)
     seal = None if key is None else seal_of(vehicle, key, store)
     sealed = voyage if seal is None else sealed_voyage(voyage)
-    modem, clock = _modem_and_clock(vehicle, modem_url, clock_url, voyage, start, seal)
+    is_at_sea = store is not None and any(store.glob("*.sqlite"))
+    modem, clock = _modem_and_clock(
+        vehicle, modem_url, clock_url, voyage, start, seal, must_answer=not is_at_sea
+    )
     files = None if out is None else VehicleFiles(out, vehicle)
     starts = 0 if files is None else files.prepare()
     try:
@@ -203,13 +206,16 @@ def _modem_and_clock(
     voyage: Voyage,
     start: str,
     seal: SealedLink | None,
+    *,
+    must_answer: bool,
 ) -> tuple[Modem, WallClock | ServedClock]:
+    """Return both; on a desk a modem must answer, at sea it may be restarting as we are."""
     context = ModemContext() if seal is None else ModemContext(stamp=seal.stamp)
     if clock_url == WALL:
         modem = open_modem(modem_url, context)
         start_utc_s = start_time_s(start)
         wall = WallClock(start_utc_s, voyage.settings.scenario.duration_s)
-        if isinstance(modem, DialectDriver):
+        if must_answer and isinstance(modem, DialectDriver):
             await_identified(modem, wall.now_s, time.sleep)
         began = datetime.datetime.fromtimestamp(start_utc_s, datetime.UTC)
         print(f"the mission starts at {began:%Y-%m-%d %H:%M:%S} UTC", file=sys.stderr)

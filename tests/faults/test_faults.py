@@ -115,6 +115,7 @@ def test_a_belief_that_was_led_astray_is_found(
     monkeypatch: pytest.MonkeyPatch, survey: Survey
 ) -> None:
     monkeypatch.setattr("host_tools.faults.mission_trial.ASTRAY_M", -1000.0)
+    monkeypatch.setattr("host_tools.faults.mission_trial.SURE_SIGMAS", 0.0)
     alone = list(Fault).index(Fault.ARRIVAL_UNVOUCHED)
     assert len(plan_of(alone, 0.0, 1.0).strikes) == 1
     assert found(mission_trial(alone, survey), "m off, dead reckoning")

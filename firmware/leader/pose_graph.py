@@ -86,7 +86,10 @@ class GraphSettings(Settings):
     )
     log_scale_sigma: float = setting(0.005, "1", "scale error of the Doppler log", minimum=1e-9)
     range_sigma_m: float = setting(
-        1.2, "m", "noise of a range (1 m, Eq. 13) and of the way to its key frames", minimum=1e-3
+        1.5,
+        "m",
+        "noise of a range (1 m, Eq. 13), of the way to its key frames, and bend",
+        minimum=1e-3,
     )
     closure_floor_m: float = setting(
         0.4, "m", "strain within a sub-map that no match can see", minimum=0.0

@@ -50,7 +50,7 @@ class RangeSettings(Settings):
         256, "ranges", "waiting for their sender's track: two minutes of four followers", minimum=16
     )
     bent_m: float = setting(
-        1.0, "m", "bend of a range up to which it is linear: its own noise (Eq. 13)", minimum=0.01
+        0.5, "m", "bend of a range that hides in its noise (1 m, Eq. 13)", minimum=0.01
     )
     bent_windows: int = setting(
         64, "windows", "of 20 s that wait until closures have straightened them", minimum=1

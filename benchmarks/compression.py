@@ -23,6 +23,7 @@ from scipy.interpolate import RegularGridInterpolator
 from threadpoolctl import threadpool_limits
 
 from benchmarks import compression_gpytorch
+from benchmarks.compression_bound import bounds_m2
 from benchmarks.compression_peers import (
     Coded,
     Decode,
@@ -35,10 +36,7 @@ from benchmarks.compression_peers import (
 from benchmarks.compression_windows import Window, windows
 from firmware.compression import compress, compress_steps, packets_from
 from firmware.compression.binning import SoundingBins
-from firmware.compression.expected import run
-from firmware.compression.field import fitted_field_steps, fitted_trend
 from firmware.compression.kernels import Kernel
-from firmware.compression.lattice_frame import lattice_frame
 from firmware.compression.settings import CompressionSettings
 from firmware.geometry import Array
 from firmware.leader.reconstruction import ReconstructionSettings, reconstruct_packets
@@ -65,8 +63,11 @@ OURS: dict[str, tuple[str, CompressionSettings]] = {
     "paper without parity": ("paper", CompressionSettings(parity=False)),
     "dense": ("dense", CompressionSettings()),
     "lattice": ("lattice", CompressionSettings()),
+    "auto, at most 10 frames": ("auto", CompressionSettings()),
     "lattice, 5 frames": ("lattice", CompressionSettings(frames=5)),
+    "lattice, 3 frames": ("lattice", CompressionSettings(frames=3)),
     "lattice, 2 frames": ("lattice", CompressionSettings(frames=2)),
+    "dense, 5 frames": ("dense", CompressionSettings(frames=5)),
     "lattice, 10 x 62 B": ("lattice", CompressionSettings(small_frames=True)),
 }
 TARGETS = {
@@ -176,24 +177,6 @@ def methods(gpytorch: bool) -> dict[str, Callable[[Window], Coded]]:
     return out
 
 
-def bounds_m2(window: Window) -> tuple[Array, Array]:
-    """Return log2 of the bits and the least mean square error, m^2, of a field of this spectrum.
-
-    What the soundings leave unknown of each cosine coefficient, plus reverse water-filling of the
-    bits over what they do tell.
-    """
-    frame = lattice_frame(window.bins, 1.0)
-    field = run(fitted_field_steps(window.bins, frame, fitted_trend(window.bins, frame)))
-    covered = len(window.grid_m)  # nodes of 1 m2; only these are counted
-    share = covered / field.spectrum_m2.size
-    known = field.spectrum_m2**2 / (field.spectrum_m2 + field.noise_m2)
-    unknown = float((field.spectrum_m2 - known).sum()) * share
-    levels = np.geomspace(float(known.max()) * 0.5, 1e-7, 60)
-    bits = [0.5 * share * np.log2(np.maximum(known / level, 1.0)).sum() for level in levels]
-    coding = np.array([np.minimum(known, level).sum() * share for level in levels])
-    return np.log2(np.maximum(bits, 1e-9)), (unknown + coding) / covered
-
-
 def fidelity(chosen: list[Window], gpytorch: bool) -> dict[str, dict[str, dict[str, object]]]:
     """Return RMSE in m, coverage, CPU and distance to the bound for each window and method."""
     table: dict[str, dict[str, dict[str, object]]] = {}
@@ -204,7 +187,7 @@ def fidelity(chosen: list[Window], gpytorch: bool) -> dict[str, dict[str, dict[s
         for name, code in coders.items():
             coded = code(window)
             coded = dataclasses.replace(coded, decode=remembered(coded.decode))
-            frames = OURS[name][1].frames if name in OURS else 10
+            frames = max(1, round(coded.size_bytes / 256)) if name in OURS else 10
             found = [rmse_m(coded, window, loss, frames) for loss in LOSSES]
             coding_m2 = np.interp(np.log2(8.0 * coded.size_bytes), *bound)
             rows[name] = {

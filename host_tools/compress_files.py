@@ -208,7 +208,7 @@ def _track_along(columns: list[Array]) -> Track:
 def _with_frames(
     settings: CompressionSettings, profile: str, frames: int | None, small: bool
 ) -> CompressionSettings:
-    if small and profile != "lattice":
+    if small and profile not in {"lattice", "auto"}:
         raise ConfigError("--small frames exist for --profile lattice only")
     if frames is None:
         frames = settings.frames if profile != "paper" else 10
@@ -228,9 +228,16 @@ def _write(path: Path, data: bytes) -> None:
 
 def _configure_compress(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("soundings", type=Path, metavar="SOUNDINGS.npz")
-    parser.add_argument("--profile", choices=PROFILES, default="paper", help="default: paper")
+    parser.add_argument(
+        "--profile",
+        choices=(*PROFILES, "auto"),
+        default="paper",
+        help="default: paper; auto: lattice in as few of the frames as do about as well",
+    )
     parser.add_argument("--out", type=Path, required=True, metavar="FRAMES.bin")
-    parser.add_argument("--frames", type=int, metavar="N", help="dense and lattice; default: 10")
+    parser.add_argument(
+        "--frames", type=int, metavar="N", help="dense and lattice; default: 10; of auto the most"
+    )
     parser.add_argument("--small", action="store_true", help="lattice in frames of 62 bytes")
 
 

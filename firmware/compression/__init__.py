@@ -1,10 +1,12 @@
 """Forty seconds of soundings in ten frames: binning, the fit, its packets."""
 
+import dataclasses
 from collections.abc import Iterator
 from typing import overload
 
 import numpy as np
 
+from firmware.compression.choice import chosen_frames
 from firmware.compression.dense import dense_code_steps
 from firmware.compression.lattice import lattice_code_steps
 from firmware.compression.packing import packets_from
@@ -16,7 +18,9 @@ from firmware.compression.results import (
     fragment_points,
 )
 from firmware.compression.settings import CompressionSettings
+from firmware.compression.track_code import USUAL_TRACK_BYTES
 from firmware.submaps import BinnedSoundings
+from protocol.lattice import PROTECTION_BYTES
 from protocol.packets import BODY_BYTES, Profile
 
 Compressed = CompressedPoints | CompressedCode
@@ -41,11 +45,12 @@ def compress_steps(
     """Yield the best compressed sub-map so far after each small step; the last is the result.
 
     The first comes at once, as cells in packets of the paper's profile, so that there is always
-    something to send; profile is `paper`, `dense` or `lattice`.
+    something to send; profile is `paper`, `dense`, `lattice`, or `auto`: `lattice` in as few of
+    the settings' frames as do about as well (`firmware.compression.choice`).
     """
     settings = settings or CompressionSettings()
-    if profile == "lattice":
-        return _lattice_steps(bins, settings)
+    if profile in {"lattice", "auto"}:
+        return _lattice_steps(bins, settings, sparing=profile == "auto")
     if profile == "dense":
         return _dense_steps(bins, settings)
     return compress_point_steps(bins, settings)
@@ -73,7 +78,9 @@ def compress(
     return best
 
 
-def _lattice_steps(bins: BinnedSoundings, settings: CompressionSettings) -> Iterator[Compressed]:
+def _lattice_steps(
+    bins: BinnedSoundings, settings: CompressionSettings, *, sparing: bool
+) -> Iterator[Compressed]:
     bins = usable(bins)
     first = unfitted(bins, settings)
     profile = Profile.SUBMAP_LATTICE_SMALL if settings.small_frames else Profile.SUBMAP_LATTICE
@@ -85,6 +92,10 @@ def _lattice_steps(bins: BinnedSoundings, settings: CompressionSettings) -> Iter
             code = stop.value
             break
         yield first
+    if sparing:
+        columns = BODY_BYTES[profile] - PROTECTION_BYTES - USUAL_TRACK_BYTES
+        frames = chosen_frames(code, columns, settings.frames, settings)
+        settings = dataclasses.replace(settings, frames=frames)
     yield CompressedCode(
         profile=profile,
         fragment_count=settings.frames,

@@ -23,7 +23,7 @@ from firmware.compression.lattice_frame import LatticeFrame, interpolation
 from firmware.geometry import Array
 from firmware.submaps import BinnedSoundings
 
-_ROUNDS = 7  # of expectation maximisation; more gains under 2 % of the error
+_ROUNDS = 10  # of expectation maximisation; more gains under 2 % of the error
 _CG_STEPS = 30  # per round, warm-started
 _CG_TOLERANCE = 1e-8  # of the right side's norm, squared; looser stops before fine detail
 _STRIDE = 1.8  # over-relaxation; plain steps take three times as many rounds on smooth bottoms

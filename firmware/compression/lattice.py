@@ -164,6 +164,17 @@ def chosen_protection(
     )
 
 
+def missing_m2(
+    progress: list[Progress], protection: Protection, columns: int, frames: int, loss: float
+) -> float:
+    """Return the squared coefficients, m^2, to be expected missing; with no map, all of them."""
+    at = [_GEOMETRY.size + step.code_bytes for step in progress]
+    missing = [step.missing_m2 for step in progress]
+    got = [protection.stream_bytes(columns, arrived) for arrived in range(frames + 1)]
+    chance = [comb(frames, r) * (1.0 - loss) ** r * loss ** (frames - r) for r in range(frames + 1)]
+    return float(np.dot(np.interp(got, at, missing, left=missing[0]), chance))
+
+
 def _column_choices(columns: int, fewest: int) -> list[int]:
     return sorted({min(fewest + round(share * (columns - fewest)), 255) for share in _SHARE_STEPS})
 

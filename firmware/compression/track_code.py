@@ -14,6 +14,7 @@ from firmware.geometry import Array, wrap_angle
 from firmware.submaps import Track
 from protocol.errors import LocalProtocolError, RemoteProtocolError
 
+USUAL_TRACK_BYTES = 20  # a straight track takes 15, a turn some more
 _FINE_M = 1.0 / 16.0
 _COARSE_M = 0.25
 _TURN_FIRST, _TURN_REST = 2.0 * np.pi / 65536.0, 2.0 * np.pi / 512.0

@@ -47,6 +47,7 @@ _TRACK_BYTES = 46  # the longest; a straight track takes 15
 _RARELY = 0.02  # how often fewer frames may arrive than give the points
 _BITS = 17  # a point at most takes, with few exceptions: 10 for its place, 7 for its depth
 _MOST_POINTS = 600
+_MOST_PLACES = 65000.0  # along a side: two bytes
 _PLACES_A_SPACING = 8.0  # steps: coarser costs error, finer bits
 _DEPTHS_AN_ERROR = 4.0  # steps of depth in the map's expected error
 _PLACE_EXPONENT, _DEPTH_EXPONENT = 8, 16  # steps are 2^(code - exponent) m
@@ -113,7 +114,9 @@ def _coded_steps(
     fitted: FittedPoints, frame: FitFrame, bins: BinnedSoundings, room: int
 ) -> Generator[None, None, DenseCode]:
     """Round places, fit the depths anew to where they lie now, and code both within the room."""
-    place_code = _exponent(spacing_of(fitted.position_m) / _PLACES_A_SPACING, _PLACE_EXPONENT)
+    wished_m = spacing_of(fitted.position_m) / _PLACES_A_SPACING
+    least_m = 2.0 * float(np.ptp(fitted.position_m, axis=0).max()) / _MOST_PLACES
+    place_code = _exponent(max(wished_m, least_m), _PLACE_EXPONENT)
     step_m = 2.0 ** (place_code - _PLACE_EXPONENT)
     corner = np.floor((fitted.position_m + frame.origin_m).min(axis=0) / step_m).astype(np.int64)
     places = np.round((fitted.position_m + frame.origin_m) / step_m).astype(np.int64) - corner
@@ -140,7 +143,7 @@ def _coded_steps(
         trial = encoder.copied()
         sent_m = encode_depths(depth_m, lower, 2.0 ** (depth_code - _DEPTH_EXPONENT), trial)
         code = trial.finish()
-        if _HEAD.size + len(code) <= room or depth_code == 255:
+        if _HEAD.size + len(code) <= room or depth_code == 2 * _DEPTH_EXPONENT:
             break
         depth_code += 1
         yield
@@ -178,6 +181,8 @@ def dense_points(
     *values, north, east, rows, columns, count, place_code, depth_code = _HEAD.unpack_from(stream)
     if not rows or not columns or count > _MOST_POINTS:
         raise RemoteProtocolError(f"{count} points in {rows} x {columns} places")
+    if place_code > 2 * _PLACE_EXPONENT or depth_code > 2 * _DEPTH_EXPONENT:
+        raise RemoteProtocolError(f"steps of code {place_code} and {depth_code}")
     wire = np.array(values, dtype=np.float32)
     hyper = Hyperparameters.from_wire(wire.astype(np.float64), 0.0)
     decoder = Decoder(stream[_HEAD.size :])
@@ -202,4 +207,4 @@ def _factor(position_m: Array, hyper: Hyperparameters) -> Array:
 
 def _exponent(step_m: float, offset: int) -> int:
     """Return the code of the power of two that is at most a step in m."""
-    return int(np.clip(np.floor(np.log2(step_m)) + offset, 0, 255))
+    return int(np.clip(np.floor(np.log2(step_m)) + offset, 0, 2 * offset))

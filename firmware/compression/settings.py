@@ -58,7 +58,7 @@ class CompressionSettings(Settings):
         4096, "rows", "bounds memory and the longest step", minimum=64, maximum=65536
     )
     iterations: int = setting(
-        40, "evaluations", "0.15 s of one core; the error is then within 5 % of settled", minimum=0
+        50, "evaluations", "0.2 s of one core; the error is then within 5 % of settled", minimum=0
     )
     dense_iterations: int = setting(
         24, "evaluations", "of `dense`, each ten times dearer than one of `paper`", minimum=0

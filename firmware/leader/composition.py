@@ -44,7 +44,7 @@ class CompositionSettings(Settings):
         60.0, "s", "between nodes beyond it: somewhat longer than a sub-map", minimum=10.0
     )
     distant_s: float = setting(
-        3600.0,
+        1800.0,
         "s",
         "beyond it pieces are four times as long, and beyond four times it again",
         minimum=1200.0,
@@ -53,7 +53,7 @@ class CompositionSettings(Settings):
         3, "", "pieces of 1, 4 and 16 minutes: nodes grow with the logarithm of time", minimum=1
     )
     closures_per_piece: int = setting(
-        3, "closures", "with older pieces; more say the same again", minimum=1
+        2, "closures", "with older pieces; more say the same again", minimum=1
     )
     reject_chi_square: float = setting(
         16.0, "1", "four sigmas: an old closure beyond it is dropped", minimum=1.0

@@ -2,7 +2,7 @@
 
     python -m benchmarks.manoeuvre [--seeds 3] [--survey-min 12] [--terrain FILE] [--set KEY=VALUE]
 
-Two vehicles survey. Then both would go straight on, off the ground that is known; the leader is
+Two vehicles survey. Then both would go straight on as the leader believes they go; it is
 asked for a proposal, and in a second run of the same seed the vehicle that it names steers so. What
 it promised stands beside what came of it: errors of both at the end of the way, as the leader
 estimates them. The proposal is found from the estimate alone; the truth is used to measure.
@@ -64,9 +64,11 @@ def sail(
 
 
 def _heading(proposal: Proposal | None, vehicle: SimulatedVehicle, follow: bool) -> float | None:
-    if not follow or proposal is None or proposal.vehicle != vehicle.index:
+    if proposal is None:
         return None
-    return math.radians(proposal.heading_deg)
+    if follow and proposal.vehicle == vehicle.index:
+        return math.radians(proposal.heading_deg)
+    return math.radians(proposal.going_on_deg[vehicle.index])
 
 
 def _error_m(leader: LeaderCore, vehicle: SimulatedVehicle) -> float:

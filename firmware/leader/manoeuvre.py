@@ -61,11 +61,15 @@ class Situation:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Proposal:
-    """A heading for one vehicle; sigmas are the root mean square over all vehicles' positions."""
+    """A heading for one vehicle; sigmas are the root mean square over all vehicles' positions.
+
+    going_on_deg are the headings of all vehicles as they go now, by the estimate.
+    """
 
     vehicle: int  # its place among the situation's
     name: str
     heading_deg: float
+    going_on_deg: tuple[float, ...]
     minutes: float
     sigma_m: float
     otherwise_m: float
@@ -81,6 +85,8 @@ class Proposal:
 def propose(situation: Situation, settings: ManoeuvreSettings) -> Proposal | None:
     """Return the candidate that leaves least uncertainty, or None if none is worth the way."""
     otherwise_m = expected_m(situation, situation.velocities_mps, settings)
+    north_mps, east_mps = situation.velocities_mps.T
+    going_on_deg = tuple(np.degrees(np.arctan2(east_mps, north_mps)).tolist())
     best: Proposal | None = None
     for vehicle, name in enumerate(situation.names):
         speed_mps = float(np.hypot(*situation.velocities_mps[vehicle]))
@@ -94,6 +100,7 @@ def propose(situation: Situation, settings: ManoeuvreSettings) -> Proposal | Non
                     vehicle=vehicle,
                     name=name,
                     heading_deg=float(heading_deg),
+                    going_on_deg=going_on_deg,
                     minutes=settings.horizon_s / 60.0,
                     sigma_m=sigma_m,
                     otherwise_m=otherwise_m,

@@ -167,13 +167,17 @@ class MissionTrial:
                 )
 
     def _progress(self, vehicle: int) -> int:
-        """Return what a vehicle has made of the other's frames: placed sub-maps, used answers."""
+        """Return what a vehicle has made of the other's frames: placed sub-maps, used answers.
+
+        An answer that is no surer than dead reckoning still gives a range.
+        """
         program = self.rig.computers[vehicle].program
         if not isinstance(program, Sailor):
             return 0
         if isinstance(program.core, JournaledLeader):
             return sum(sheet.id.vehicle == 1 for sheet in program.core.atlas)
-        return program.core.status()["answers_used"]
+        status = program.core.status()
+        return status["answers_used"] + status["ranges_used"]
 
     def _look(self) -> None:
         for vehicle, computer in enumerate(self.rig.computers):

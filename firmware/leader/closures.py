@@ -1,5 +1,6 @@
 """Loop closures: which pairs of sub-maps to match, and what becomes of what the match finds."""
 
+import contextlib
 import dataclasses
 import enum
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from firmware.leader.matching import Hint, MatchingSettings, MatchOutcome, match
 from firmware.leader.pairing import Calibrations, side_of
 from firmware.leader.pose_graph import PoseGraph
 from firmware.submaps import GriddedSubmap
+from protocol.errors import EstimationError
 from protocol.settings import Settings, setting
 
 
@@ -121,6 +123,8 @@ def jobs_for(
 
     Pairs that the graph knows well teach the calibrations first (new ones, if none are given);
     then what the sonars do wrong is taken out of all.
+
+    Raises EstimationError if the sheet itself hangs on no node.
     """
     calibrations = calibrations or Calibrations(matching)
     target = side_of(sheet, graph.trajectory(sheet.id.chain))
@@ -271,9 +275,11 @@ def _ranked(
     centres_m = np.array([other.centre_m for other in others]) + moves_m
     own_m = _correction(sheet, graph)
     distances_m = np.hypot(*(centres_m - sheet.centre_m - own_m).T)
-    anchors = [_anchor(sheet, graph)]
-    nearest = np.argsort(distances_m, kind="stable")[: settings.screened_per_submap]
-    anchors += [_anchor(others[k], graph) for k in nearest]
+    anchors, nearest = [_anchor(sheet, graph)], []
+    for k in np.argsort(distances_m, kind="stable")[: settings.screened_per_submap]:
+        with contextlib.suppress(EstimationError):  # it hangs on no node: frames were lost there
+            anchors.append(_anchor(others[k], graph))
+            nearest.append(k)
     joint_m2 = graph.covariance(anchors).reshape(len(anchors), 2, len(anchors), 2)
     ranked = []
     for position, k in enumerate(nearest, start=1):

@@ -204,15 +204,14 @@ class LeaderCore:
             return None
         self.graph.update()
         self._jobs_out = True
-        sheet = self._sheets_to_match.popleft()
-        jobs = jobs_for(
-            sheet,
-            self.atlas,
-            self.graph,
-            self._settings.closures,
-            self._settings.matching,
-            self._calibrations,
-        )
+        sheet, s = self._sheets_to_match.popleft(), self._settings
+        try:
+            jobs = jobs_for(
+                sheet, self.atlas, self.graph, s.closures, s.matching, self._calibrations
+            )
+        except EstimationError:
+            self.counters["submaps_unplaceable"] += 1
+            jobs = []
         return SheetJobs(sheet=sheet, jobs=tuple(jobs))
 
     def finish(self, done: SheetJobs, outcomes: list[MatchOutcome], now_s: float) -> None:

@@ -1,9 +1,10 @@
 """Which gated closures to believe: the graph, other closures and the map are asked in turn.
 
 A closure is consistent when the graph already knew its offset to a few metres (then its gate was
-proof enough), when another closure closes a loop with it (pairwise consistency), or when the map
-that it would build agrees where the match did not look. This is our reading of the paper's MCM,
-identification of invalid closures by the consistency of the built map; its text is not public.
+proof enough), when another closure closes a loop with it (pairwise consistency), or, unless it
+holds along one axis only, when the map that it would build agrees where the match did not look.
+This is our reading of the paper's MCM, identification of invalid closures by the consistency of the
+built map; its text is not public.
 What is not yet believed waits, and is asked again when more is known. An audit takes back closures
 that the estimate has come to contradict, and takes them in again when it no longer does.
 """
@@ -94,7 +95,8 @@ class Judgement:
                 if found.believed[k] and found.partners[k] > 0:
                     self._believe(closure, graph, "partners")
         for closure in doubtful:
-            if not closure.active and self._map_agrees(closure, atlas, graph):
+            slides = closure.axis_deg is not None  # and the map beside it slides along
+            if not slides and not closure.active and self._map_agrees(closure, atlas, graph):
                 self._believe(closure, graph, "map")
         waiting = [c for c in candidates if not c.active]
         self.counters["closures_given_up"] += max(0, len(waiting) - self._settings.waiting)

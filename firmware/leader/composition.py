@@ -89,7 +89,8 @@ def kept_nodes(
     piece_from_s = times_s
     for level in range(s.levels):
         piece_s = s.piece_s * _COARSER**level
-        age_s = s.distant_s * _COARSER ** (level - 1) if level else s.detail_s
+        distant_s = s.distant_s * _COARSER ** (level - 1) if level else 0.0
+        age_s = max(distant_s, s.detail_s)
         until_s = np.floor((now_s - age_s) / piece_s) * piece_s
         begin_s = np.floor(times_s / piece_s) * piece_s
         piece_from_s = np.where(times_s < until_s, begin_s, piece_from_s)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from firmware.geometry import Array
-from firmware.leader.composition import CompositionSettings
+from firmware.leader.chains import Chain
+from firmware.leader.composition import CompositionSettings, kept_nodes
 from firmware.leader.ledger import ClosureRecord, OdometryRecord, RangeRecord, SharedWalkRecord
 from firmware.leader.pose_graph import GraphSettings, PoseGraph
 from firmware.submaps import Track
@@ -188,3 +189,11 @@ def test_every_kept_node_is_tied_to_the_one_before(coarse: Voyage) -> None:
 def _composed(voyage: Voyage) -> PoseGraph:
     voyage.graph.compose(3600 * HOURS, SETTINGS)
     return voyage.graph
+
+
+def test_window_of_detail_keeps_every_node_whatever_is_called_distant() -> None:
+    chain = Chain(number=0, parameters=0)
+    chain.times_s = [10.0 * k for k in range(300)]
+    chain.keys = list(range(300))
+    settings = CompositionSettings(detail_s=3000.0, distant_s=1200.0)
+    assert kept_nodes(chain, 2990.0, set(), settings).all()

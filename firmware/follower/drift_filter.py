@@ -67,10 +67,15 @@ class DriftFilter:
         self._settings = settings
 
     def deployed(self, time_s: float) -> DriftState:
-        """Return what is known at the start."""
+        """Return what is known at a start; a later one than the mission's has drifted since.
+
+        A vehicle that begins without its past, its store gone, begins where dead reckoning is.
+        """
         s = self._settings
         sigmas = np.repeat([s.start_sigma_m, s.bias_sigma_mps, 1.0, 1.0], 2)
-        return DriftState(time_s=time_s, mean=np.zeros(8), covariance=np.diag(sigmas**2))
+        first_s = min(time_s, 0.0)
+        state = DriftState(time_s=first_s, mean=np.zeros(8), covariance=np.diag(sigmas**2))
+        return self.predicted(state, time_s)
 
     def updated(self, state: DriftState, one: AnswerSeen | RangeSeen) -> DriftState:
         """Return the state after something seen, at its time."""

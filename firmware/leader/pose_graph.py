@@ -98,6 +98,16 @@ class GraphSettings(Settings):
         3.0, "sigma", "Huber: convex, so that large true innovations cannot stick", minimum=0.1
     )
 
+    def start_sigma_at(self, time_s: float) -> float:
+        """Return how uncertain a chain begins that is first heard of, or begun anew, at a time.
+
+        Starts are known at mission time zero; dead reckoning has run away from them since.
+        """
+        alone_s = max(time_s, 0.0)
+        drifted = (self.odometry_noise**2 + self.bias_sigma_mps**2 * alone_s) * alone_s
+        wandered = self.bias_walk**2 * alone_s**3 / 3.0
+        return float(np.sqrt(self.start_sigma_m**2 + drifted + wandered))
+
 
 class PoseGraph:
     """Every vehicle's trajectory, and what ties them together."""
@@ -148,7 +158,7 @@ class PoseGraph:
         start_sigma_m: float | None = None,
         like: int | None = None,
     ) -> None:
-        """Start a vehicle's chain at a position (2,), as uncertain as the settings say, or as told.
+        """Start a vehicle's chain at a position (2,), as uncertain as its time says, or as told.
 
         Its drift is like that of the first chain; or of the chain `like`, an earlier boot's, whose
         newest drift it goes on with.
@@ -160,7 +170,7 @@ class PoseGraph:
         state = np.concatenate([start_m, np.zeros(2)])
         key = self._append(chain, time_s, reckoned_m, state)
         self._fresh.insert(chain.parameters, np.zeros(2))
-        sigmas = np.repeat([start_sigma_m or s.start_sigma_m, s.bias_sigma_mps], 2)
+        sigmas = np.repeat([start_sigma_m or s.start_sigma_at(time_s), s.bias_sigma_mps], 2)
         self._enter(PriorRecord(key=key, mean=state, sigmas=sigmas))
         calibration = np.array([np.radians(s.heading_bias_sigma_deg), s.log_scale_sigma])
         self._enter(PriorRecord(key=chain.parameters, mean=np.zeros(2), sigmas=calibration))

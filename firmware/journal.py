@@ -26,6 +26,8 @@ from protocol.settings import Settings, setting
 LOG = logging.getLogger(__name__)
 SCHEMA = "2"
 BOOT_EPOCHS = 16  # the header has 4 bits for it
+LIFE_S = 40.0
+"""A life that is shorter has sent no sub-map: lives that no disk counts are told apart by this."""
 REPLAYS_TRIED = 5
 """A store whose replay ended the process so often is set aside: something in it is deadly."""
 
@@ -80,8 +82,11 @@ class Journal:
         On opening: when another process holds the store, or it is another vehicle's.
     """
 
-    def __init__(self, folder: Path, owner: Owner, settings: JournalSettings) -> None:
+    def __init__(
+        self, folder: Path, owner: Owner, settings: JournalSettings, began_s: float = 0.0
+    ) -> None:
         self.settings, self.counters = settings, Counter[str]()
+        self._began_s = began_s  # of this life, by the mission's clock
         self._owner, self._path = owner, folder / f"{owner.name}.sqlite"
         self._waiting: list[bytes] = []
         self._full: deque[tuple[int, bytes]] = deque()  # rows that the disk did not take
@@ -93,8 +98,7 @@ class Journal:
             folder.mkdir(parents=True, exist_ok=True)
             self._open()
         except (OSError, sqlite3.Error) as error:
-            self.boot_epoch = self._next_epoch()
-            self._lose(error)
+            self._lose_from_the_start(error)
 
     @property
     def is_resumed(self) -> bool:
@@ -184,7 +188,7 @@ class Journal:
         try:
             self._begin_after(why)
         except (OSError, sqlite3.Error) as error:
-            self._lose(error)
+            self._lose_from_the_start(error)
 
     def close(self) -> None:
         """Commit and close."""
@@ -329,6 +333,11 @@ class Journal:
             with contextlib.suppress(sqlite3.Error):
                 self._connection.execute("REPLACE INTO about VALUES (?, ?)", (name, value))
 
+    def _lose_from_the_start(self, error: Exception) -> None:
+        """Go on in memory, in an epoch by the clock: the disk does not count this life."""
+        self.boot_epoch = uncounted_epoch(self._next_epoch(), self._began_s)
+        self._lose(error)
+
     def _lose(self, error: Exception) -> None:
         """Go on in memory; what is on disk stays as it is."""
         self.counters["store_lost"] += 1
@@ -341,6 +350,15 @@ class Journal:
                 self._connection.close()
         self._connection = None
         self._waiting, self._full = [], deque()
+
+
+def uncounted_epoch(following: int, began_s: float) -> int:
+    """Return the epoch of a life that is not counted on a disk, whose next count is `following`.
+
+    It is neither that nor the one before, and another than that of any life that began at least
+    LIFE_S and at most eight minutes earlier.
+    """
+    return (following + 1 + int(began_s // LIFE_S) % (BOOT_EPOCHS - 2)) % BOOT_EPOCHS
 
 
 def _split(data: bytes) -> Iterator[tuple[int, bytes]]:

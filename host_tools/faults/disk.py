@@ -129,9 +129,11 @@ class MemoryFiles:
 class FatedJournal(Journal):
     """A journal on the real disk, under a fate."""
 
-    def __init__(self, folder: Path, owner: Owner, settings: JournalSettings, fate: Fate) -> None:
+    def __init__(
+        self, folder: Path, owner: Owner, settings: JournalSettings, fate: Fate, began_s: float
+    ) -> None:
         self._fate, self._at = fate, folder / f"{owner.name}.sqlite"
-        super().__init__(folder, owner, settings)
+        super().__init__(folder, owner, settings, began_s)
 
     def append(self, kind: int, body: bytes = b"") -> None:
         """Append, unless death comes first."""

@@ -199,7 +199,8 @@ class MissionTrial:
         steps = self._survey.steps(vehicle, clock, self.rig.now_s)
         start, passed, steps = navigated(self._survey.start(vehicle), steps, now_s)
         owner = Owner(vehicle=vehicle, fingerprint="faults")
-        journal = FatedJournal(self._folder, owner, JournalSettings(checkpoint_s=30.0), fate)
+        kept = JournalSettings(checkpoint_s=30.0)
+        journal = FatedJournal(self._folder, owner, kept, fate, began_s=now_s)
         try:
             core = resumed_core(journal, vehicle, start, settings, now_s)
             self._hold_to_account(vehicle, core, fate)

@@ -78,7 +78,7 @@ def open_core(
     """
     version = metadata.version("fathomlink")
     owner = Owner(vehicle=vehicle, fingerprint=f"{voyage.fingerprint} {version}")
-    journal = Journal(store, owner, JournalSettings())
+    journal = Journal(store, owner, JournalSettings(), first_s)
     return resumed_core(journal, vehicle, start, voyage.settings, first_s)
 
 

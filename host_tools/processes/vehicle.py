@@ -16,6 +16,7 @@ import numpy as np
 from firmware.clock import WallClock
 from firmware.follower.core import FollowerCore
 from firmware.follower.loop import FollowerLoop
+from firmware.journal import BOOT_EPOCHS, LIFE_S
 from firmware.leader.core import LeaderCore
 from firmware.leader.loop import LeaderLoop
 from firmware.leader.worker import InlineWorker, ThreadWorker, Worker
@@ -48,7 +49,6 @@ from protocol.modems.sealed import SealedLink, SealedModem
 from protocol.packets import FRAME_BYTES, SMALL_FRAME_BYTES
 
 LEADER = 0
-BOOT_EPOCHS = 16
 STATUS_S = 60.0
 WALL = "wall"
 
@@ -84,7 +84,7 @@ def run_vehicle(
         vehicle, modem_url, clock_url, voyage, start, seal, must_answer=not is_at_sea
     )
     files = None if out is None else VehicleFiles(out, vehicle)
-    starts = 0 if files is None else files.prepare()
+    starts = None if files is None else files.prepare()
     try:
         profile = voyage.settings.follower.profile
         is_small = profile == "lattice" and voyage.settings.follower.compression.small_frames
@@ -133,7 +133,7 @@ def _sail(aboard: Aboard, ticks: Iterator[float], *, on_wall: bool) -> None:
 
 def _board(
     vehicle: int,
-    starts: int,
+    starts: int | None,
     modem: Modem,
     clock: WallClock | ServedClock,
     voyage: Voyage,
@@ -141,14 +141,18 @@ def _board(
     first_s: float,
     store: Path | None,
 ) -> Aboard:
-    """Return the vehicle with core, loop and sensors as of its first tick."""
+    """Return the vehicle with core, loop and sensors as of its first tick.
+
+    starts is how often it started before; None where that is not kept, and the clock tells boots.
+    """
     truth_map = DepthMap(voyage.site.window)
     simulated = SimulatedVehicle(
         voyage.settings.scenario, voyage.site.seabed, vehicle, voyage.seed, truth_map.add
     )
     start, passed, steps = navigated(deployed(simulated), simulated.steps(), first_s)
+    boot = math.floor(first_s / LIFE_S) if starts is None else starts
     core = (
-        plain_core(vehicle, starts % BOOT_EPOCHS, start, voyage)
+        plain_core(vehicle, boot % BOOT_EPOCHS, start, voyage)
         if store is None
         else open_core(vehicle, store, start, voyage, first_s)
     )

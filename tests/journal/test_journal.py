@@ -168,6 +168,20 @@ def test_folder_that_cannot_be_written_leaves_the_mission_in_memory(
     assert "the mission goes on in memory" in caplog.text
 
 
+def test_lives_that_no_disk_counts_are_told_apart_by_the_clock(tmp_path: Path) -> None:
+    counted = opened(tmp_path)
+    counted.close()
+    (tmp_path / "follower_1.sqlite").unlink()
+    (tmp_path / "follower_1.sqlite").mkdir()  # can neither be opened nor be made
+    settings = JournalSettings()
+    begins_s = (0.0, 99.0, 139.0, 430.0, 470.0)
+    lives = [Journal(tmp_path, OWNER, settings, began_s) for began_s in begins_s]
+    assert all(life.counters["store_lost"] for life in lives)
+    epochs = [life.boot_epoch for life in lives]
+    assert len(set(epochs)) == len(epochs)
+    assert not set(epochs) & {counted.boot_epoch, counted.boot_epoch + 1}
+
+
 def full(journal: Journal, pages: int) -> None:
     """Let the disk have as many pages as the store has now, or some more."""
     database = journal._connection

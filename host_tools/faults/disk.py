@@ -160,6 +160,9 @@ class FatedJournal(Journal):
         """Leave the files as a dead process does, what waits is lost, the lock is free."""
         files = self._snapshot() if files is None else files
         self._close()
+        if self._fate.struck is Fault.STORE_CORRUPT:
+            files = {path: self._fate.damage(data) for path, data in files.items()}
+            self._fate.fired(Fault.STORE_CORRUPT)
         for path, data in files.items():
             path.write_bytes(data)
 

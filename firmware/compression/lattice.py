@@ -15,6 +15,7 @@ import numpy as np
 from firmware.compression import bitplanes
 from firmware.compression.bitplanes import Progress
 from firmware.compression.calibration import widening, without_tail
+from firmware.compression.dense import frames_relied_on
 from firmware.compression.field import Field, Trend, fitted_field_steps, fitted_trend, surface_m
 from firmware.compression.footprint import (
     Mask,
@@ -132,7 +133,8 @@ def chosen_protection(
     """Return the protection of least expected error among those that a grid of shares offers.
 
     The first part holds geometry, footprint and, as far as a quarter of the columns allows,
-    usable_bytes of coefficients.
+    usable_bytes of coefficients. Where usable_frames give geometry and footprint only by most of
+    their columns, as small frames do, more frames must come together for a map.
     """
     loss = settings.expected_loss
     arrived = np.arange(frames + 1)
@@ -142,7 +144,11 @@ def chosen_protection(
     at = np.array([_GEOMETRY.size + step.code_bytes for step in progress], dtype=np.float64)
     missing = np.array([step.missing_m2 for step in progress])
     k0 = min(settings.usable_frames, frames)
-    needed = -(-int(at[0]) // k0)
+    relied_on = frames_relied_on(frames, loss)
+    while (needed := -(-int(at[0]) // k0)) > columns // 2 and k0 < frames:
+        if needed <= columns and k0 >= relied_on:
+            break
+        k0 += 1
     wished = -(-(int(at[0]) + settings.usable_bytes) // k0)
     needed = min(max(needed, min(wished, columns // 4)), columns)
     choices = np.array(

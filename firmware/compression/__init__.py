@@ -9,7 +9,7 @@ import numpy as np
 from firmware.compression.choice import chosen_frames
 from firmware.compression.dense import dense_code_steps
 from firmware.compression.lattice import lattice_code_steps
-from firmware.compression.packing import packets_from
+from firmware.compression.packing import filled_bytes, packets_from
 from firmware.compression.points import compress_point_steps, unfitted, usable
 from firmware.compression.results import (
     CompressedCode,
@@ -21,7 +21,7 @@ from firmware.compression.settings import CompressionSettings
 from firmware.compression.track_code import USUAL_TRACK_BYTES
 from firmware.submaps import BinnedSoundings
 from protocol.lattice import PROTECTION_BYTES
-from protocol.packets import BODY_BYTES, Profile
+from protocol.packets import Profile
 
 Compressed = CompressedPoints | CompressedCode
 
@@ -84,7 +84,8 @@ def _lattice_steps(
     bins = usable(bins)
     first = unfitted(bins, settings)
     profile = Profile.SUBMAP_LATTICE_SMALL if settings.small_frames else Profile.SUBMAP_LATTICE
-    steps = lattice_code_steps(bins, settings.lattice_step_m, settings.frames * BODY_BYTES[profile])
+    size = filled_bytes(profile, settings)
+    steps = lattice_code_steps(bins, settings.lattice_step_m, settings.frames * size)
     while True:
         try:
             next(steps)
@@ -93,7 +94,7 @@ def _lattice_steps(
             break
         yield first
     if sparing:
-        columns = BODY_BYTES[profile] - PROTECTION_BYTES - USUAL_TRACK_BYTES
+        columns = size - PROTECTION_BYTES - USUAL_TRACK_BYTES
         frames = chosen_frames(code, columns, settings.frames, settings)
         settings = dataclasses.replace(settings, frames=frames)
     yield CompressedCode(
@@ -109,7 +110,7 @@ def _dense_steps(bins: BinnedSoundings, settings: CompressionSettings) -> Iterat
     bins = usable(bins)
     best: Compressed = unfitted(bins, settings)
     yield best
-    size = BODY_BYTES[Profile.SUBMAP_DENSE]
+    size = filled_bytes(Profile.SUBMAP_DENSE, settings)
     for step in dense_code_steps(bins, settings, size):
         if step is not None:
             code, fitted = step

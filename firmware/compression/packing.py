@@ -8,12 +8,14 @@ from numpy.typing import NDArray
 from firmware.compression.dense import DenseCode, dense_bodies
 from firmware.compression.lattice import lattice_bodies
 from firmware.compression.results import CompressedCode, CompressedPoints, fragment_points
+from firmware.compression.settings import CompressionSettings
 from firmware.compression.track_code import encode_track
 from firmware.submaps import Track
 from protocol.packets import (
     BODY_BYTES,
     STATES_PER_FRAGMENT,
     Header,
+    Profile,
     SubmapFragment,
     SubmapPacket,
 )
@@ -53,9 +55,14 @@ def packets_from(
     return packets
 
 
+def filled_bytes(profile: Profile, settings: CompressionSettings) -> int:
+    """Return how much of a body a code may fill; where frames are sealed, the rest stays zero."""
+    return BODY_BYTES[profile.sealed if settings.sealed else profile]
+
+
 def _bodies(compressed: CompressedCode, track: bytes) -> list[bytes]:
-    size, frames = BODY_BYTES[compressed.profile], compressed.fragment_count
-    settings = compressed.settings
+    settings, frames = compressed.settings, compressed.fragment_count
+    size = filled_bytes(compressed.profile, settings)
     if isinstance(compressed.code, DenseCode):
         return dense_bodies(compressed.code, track, size, frames)
     return lattice_bodies(compressed.code, track, size, frames, settings)
@@ -73,7 +80,7 @@ def _fragments(
                 fragment=index,
                 fragment_count=len(bodies),
             ),
-            body=body,
+            body=body.ljust(BODY_BYTES[compressed.profile], b"\x00"),
         )
         for index, body in enumerate(bodies)
     ]

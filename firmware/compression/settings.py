@@ -74,6 +74,9 @@ class CompressionSettings(Settings):
         10, "frames", "a sub-map of `dense` or `lattice`; `paper` has ten", minimum=1, maximum=15
     )
     small_frames: bool = setting(False, "", "`lattice` in frames of 62 bytes instead of 256")
+    sealed: bool = setting(
+        False, "", "`dense` and `lattice` leave the last 12 bytes of a body to its seal"
+    )
     lattice_step_m: float = setting(
         1.0,
         "m",

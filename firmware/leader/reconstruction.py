@@ -22,7 +22,7 @@ from firmware.geometry import Array
 from firmware.submaps import GriddedSubmap, Track
 from protocol.errors import EstimationError, RemoteProtocolError
 from protocol.lattice import PROTECTION_BYTES
-from protocol.packets import Profile, SubmapFragment, SubmapPacket, usable_states
+from protocol.packets import SEAL_BYTES, Profile, SubmapFragment, SubmapPacket, usable_states
 from protocol.settings import Settings, setting
 from protocol.timestamps import from_quarters
 
@@ -39,6 +39,9 @@ class ReconstructionSettings(Settings):
     max_variance_m2: float = setting(0.1, "m2", "paper, 4.2: above it depths are dropped")
     max_cells: int = setting(
         1_000_000, "cells", "25 MB; a swath at 1 m has 22,500", minimum=100, maximum=10_000_000
+    )
+    sealed: bool = setting(
+        False, "", "the last 12 bytes of `dense` and `lattice` bodies were their seal's"
     )
 
 
@@ -101,7 +104,8 @@ def _from_bodies(
     first_s = from_quarters(first.header.time_quarters, near_s)
     try:
         track, taken = decode_track(first.body[PROTECTION_BYTES:], first_s)
-        bodies = {index: fragment.body for index, fragment in fragments.items()}
+        seal_bytes = SEAL_BYTES if settings.sealed else 0
+        bodies = {i: f.body[: len(f.body) - seal_bytes] for i, f in fragments.items()}
         if first.header.profile.plain is Profile.SUBMAP_DENSE:
             points_ned_m, hyper = dense_points(bodies, taken, first.header.fragment_count)
             grid = reconstruct_points(points_ned_m, hyper, track, settings)

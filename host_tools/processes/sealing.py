@@ -33,15 +33,10 @@ def seal_of(vehicle: int, key: Path, store: Path | None) -> SealedLink:
 
 
 def sealed_voyage(voyage: Voyage) -> Voyage:
-    """Return the voyage with sub-maps that leave a seal its place.
-
-    Raises
-    ------
-    ConfigError
-        For the profiles whose frames have no room.
-    """
-    profile = voyage.settings.follower.profile
-    if profile != "paper":
-        raise ConfigError(f"--key is for --profile paper; a {profile} frame has no room for a seal")
-    plain = replace(voyage.settings, {"follower.compression.parity": False})
-    return dataclasses.replace(voyage, settings=plain)
+    """Return the voyage with sub-maps that leave a seal its place."""
+    changes = {
+        "follower.compression.parity": False,
+        "follower.compression.sealed": True,
+        "leader.reconstruction.sealed": True,
+    }
+    return dataclasses.replace(voyage, settings=replace(voyage.settings, changes))

@@ -1,7 +1,8 @@
 """Sealed mode: a modem whose frames are sealed on their way out and verified on their way in.
 
-Cores stay as they are: what a seal takes from a frame (the fifteenth point, one state of twenty) is
-left out before it, and stands as NaN, unused, in the frame that the receiving core is given.
+What a seal takes from a frame (the fifteenth point, one state of twenty, twelve bytes of a coded
+body) is left out before it, and stands unused, NaN or zero, in the frame that the receiving core
+is given.
 """
 
 from collections import Counter
@@ -16,8 +17,10 @@ from protocol.modems.stamping import stamp_frame
 from protocol.packets import (
     POINTS_PER_FRAGMENT,
     POINTS_PER_SEALED_FRAGMENT,
+    SEAL_BYTES,
     Array32,
     Packet,
+    SubmapFragment,
     SubmapPacket,
     TrajectoryPacket,
 )
@@ -25,6 +28,7 @@ from protocol.seal import Opener, Sealer
 from protocol.timestamps import QUARTERS_MODULO
 
 _QUARTERS_PER_STATE = 4
+_UNUSED = bytes(SEAL_BYTES)
 
 
 class SealedLink:
@@ -116,6 +120,8 @@ def _with_room(packet: Packet) -> Packet:
     """Return a packet that leaves the seal its place; the oldest state of a trajectory goes."""
     if isinstance(packet, SubmapPacket):
         return replace(packet, points_ned_m=packet.points_ned_m[:POINTS_PER_SEALED_FRAGMENT])
+    if isinstance(packet, SubmapFragment) and packet.body.endswith(_UNUSED):
+        return replace(packet, body=packet.body.removesuffix(_UNUSED))
     if isinstance(packet, TrajectoryPacket):
         later = (packet.header.time_quarters + _QUARTERS_PER_STATE) % QUARTERS_MODULO
         header = replace(packet.header, time_quarters=later)
@@ -127,6 +133,8 @@ def _whole(packet: Packet) -> Packet:
     """Return an opened packet in the size of a plain one, NaN where the seal was."""
     if isinstance(packet, SubmapPacket):
         return replace(packet, points_ned_m=_padded(packet.points_ned_m, POINTS_PER_FRAGMENT))
+    if isinstance(packet, SubmapFragment):
+        return replace(packet, body=packet.body + _UNUSED)
     if isinstance(packet, TrajectoryPacket):
         return replace(packet, states=_padded(packet.states, len(packet.states) + 1))
     return packet

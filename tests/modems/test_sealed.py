@@ -96,6 +96,27 @@ def test_a_trajectory_crosses_without_its_oldest_state() -> None:
     assert packet.header.time_quarters == 2  # one second later, across the turn of the field
 
 
+@pytest.mark.parametrize(
+    ("profile", "body_bytes"),
+    [
+        (Profile.SUBMAP_DENSE, 244),
+        (Profile.SUBMAP_LATTICE, 244),
+        (Profile.SUBMAP_LATTICE_SMALL, 50),
+    ],
+)
+def test_a_coded_body_crosses_without_its_unused_end(profile: Profile, body_bytes: int) -> None:
+    body = b"\xa5" * (body_bytes - 12) + bytes(12)
+    packet = SubmapFragment(header=replace(trajectory().header, profile=profile), body=body)
+    frame = link(1).seal(encode(packet))
+    assert frame is not None
+    assert len(frame) == len(encode(packet))
+    sealed = decode(frame)
+    assert isinstance(sealed, SealedFrame)
+    assert len(sealed.body) == body_bytes - 12
+    opened = link(0).open(frame)
+    assert opened == encode(packet)
+
+
 def test_plain_frames_are_not_let_through_and_counted() -> None:
     water = medium()
     leader = SealedModem(water.modem(0), link(0))
@@ -111,7 +132,7 @@ def test_a_frame_that_cannot_be_sealed_stays_here() -> None:
     for now_s in (0.0, 4.0):
         follower.send(encode(trajectory()), now_s)
     header = replace(trajectory().header, profile=Profile.SUBMAP_DENSE)
-    follower.send(encode(SubmapFragment(header=header, body=bytes(244))), 8.0)
+    follower.send(encode(SubmapFragment(header=header, body=b"\xff" * 244)), 8.0)
     assert follower.status().sent == 1
     assert follower.status().errors == {"not_sealed": 2}
 

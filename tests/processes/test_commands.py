@@ -1,6 +1,7 @@
 """The commands themselves: real processes, real ports, and what they say when something is off."""
 
 import itertools
+import json
 import os
 import signal
 import subprocess
@@ -16,7 +17,9 @@ from host_tools.cli import main
 from host_tools.emulators.ptys import PseudoPort
 from host_tools.processes.demo import Crew
 from host_tools.processes.vehicle import start_time_s
+from protocol.codec import decode
 from protocol.errors import ConfigError
+from protocol.packets import SealedFrame
 
 SHORT = ["--seed", "5", "--set", "duration_min=2.5", "--set", "beams=32"]
 SHORT += ["--set", "follower_duration_min=2"]
@@ -125,7 +128,6 @@ def test_a_modem_that_is_too_small_for_the_profile_is_told(
         (0o600, 64, [], "--key needs --store"),
         (0o644, 64, ["--store"], "has mode 0644; type: chmod 600"),
         (0o600, 60, ["--store"], "holds 60 characters, not 64 hexadecimal digits"),
-        (0o600, 64, ["--profile", "dense", "--store"], "a dense frame has no room for a seal"),
     ],
 )
 def test_a_key_that_cannot_be_used_is_one_line(
@@ -152,6 +154,50 @@ def test_a_start_is_a_whole_second_of_utc() -> None:
     assert start_time_s("next") % 60.0 == 0.0
     with pytest.raises(ConfigError, match="whole second"):
         start_time_s("1970-01-01T00:00:00.5Z")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "profile",
+    [
+        ["paper"],
+        ["dense"],
+        ["lattice"],
+        ["lattice", "--set", "follower.compression.small_frames=1"],
+    ],
+    ids=lambda profile: f"{profile[0]}-{len(profile)}",
+)
+def test_two_processes_with_a_key_map_together_in_every_profile(
+    tmp_path: Path, profile: list[str]
+) -> None:
+    out, ports, key = tmp_path / "out", tmp_path / "p", tmp_path / "key"
+    key.write_text("5a" * 32)
+    key.chmod(0o600)
+    minutes = ["--set", "duration_min=5", "--set", "follower_duration_min=5"]
+    mission = ["--profile", *profile, "--out", str(out), "--seed", "5", *minutes]
+    program = [sys.executable, "-m", "host_tools.cli"]
+    channel = subprocess.Popen(
+        [*program, "channel", "--no-report", "--ports", str(ports), *mission],
+        stdout=subprocess.DEVNULL,
+    )
+
+    def vehicle(name: str, port: str) -> "subprocess.Popen[bytes]":
+        at = ["--modem", f"serial://{ports}/{port}", "--clock", f"unix://{ports}/clock"]
+        sealed = ["--key", str(key), "--store", str(tmp_path / name)]
+        return subprocess.Popen([*program, name, *at, *sealed, *mission])
+
+    while not (ports / "follower-1").exists():
+        time.sleep(0.05)
+    crew = [vehicle("leader", "leader"), vehicle("follower", "follower-1")]
+    assert [process.wait(timeout=120) for process in (channel, *crew)] == [0, 0, 0]
+    frames = [json.loads(line) for line in (out / "air.jsonl").read_text().splitlines()]
+    sent = [decode(bytes.fromhex(f["hex"])) for f in frames if f["fate"] == "delivered"]
+    assert len(sent) > 40
+    assert all(isinstance(packet, SealedFrame) for packet in sent)
+    leader = json.loads((out / "processes" / "leader.json").read_text())
+    came = leader["reassembly_complete"] + leader["reassembly_partial"]
+    assert came >= 2
+    assert leader.get("submaps_empty", 0) + leader.get("submaps_not_rebuilt", 0) < came
 
 
 @pytest.mark.slow

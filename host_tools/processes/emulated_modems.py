@@ -23,9 +23,10 @@ MODEMS: dict[str, tuple[str, ...]] = {
         "slots.leader_period_s=40",
         "slots.leader_offsets_s=5,13,21,29",
     ),
-    "nanomodem": (),
+    "nanomodem": ("follower.compression.small_frames=true",),
 }
-"""What is at the ports, and the slots that it needs: a pair of frames sounds for three seconds."""
+"""What is at the ports, and what it needs: slots for pairs of frames that sound for three seconds,
+or frames of 62 bytes."""
 _BAUD = {"micromodem": 19_200, "nanomodem": 9_600}
 HANDOVER_S = 2.0
 """Of real time: a kernel that has not passed bytes on by then has lost them."""

@@ -75,7 +75,7 @@ def test_a_follower_has_as_many_frames_for_a_slot_as_it_holds() -> None:
 
 @pytest.mark.slow
 def test_a_mission_on_emulated_micromodems_at_rate_4(tmp_path: Path) -> None:
-    short = ["duration_min=4", "follower_duration_min=4", "leg_m=100", "beams=32"]
+    short = ["duration_min=7", "follower_duration_min=7", "leg_m=100", "beams=32"]
     arguments = [part for change in short for part in ("--set", change)]
     for name in ("one", "two"):
         assert (
@@ -95,3 +95,31 @@ def test_a_mission_on_emulated_micromodems_at_rate_4(tmp_path: Path) -> None:
     assert [f["fate"] for f in ours[::2]] == [f["fate"] for f in ours[1::2]]
     leader = json.loads((tmp_path / "one" / "processes" / "leader.json").read_text())
     assert leader["ranges_used"] >= 10
+
+
+@pytest.mark.slow
+def test_a_mission_of_small_lattice_frames_on_emulated_nanomodems(tmp_path: Path) -> None:
+    short = ["duration_min=6", "follower_duration_min=6", "leg_m=200", "beams=64"]
+    arguments = [part for change in short for part in ("--set", change)]
+    run = ["demo", "--modems", "nanomodem", "--profile", "lattice", "--out", str(tmp_path)]
+    assert main([*run, *arguments]) == 0
+    frames = [json.loads(line) for line in (tmp_path / "air.jsonl").read_text().splitlines()]
+    ours = [frame for frame in frames if frame["source"] == 1]
+    assert len(ours) >= 60
+    assert {len(frame["hex"]) for frame in ours} == {2 * (62 + 2)}  # behind sender and sequence
+    leader = json.loads((tmp_path / "processes" / "leader.json").read_text())
+    assert leader.get("submaps_not_rebuilt", 0) <= 1  # the last one may be cut
+    follower = json.loads((tmp_path / "processes" / "follower_1.json").read_text())
+    assert follower["answers_used"] >= 10
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["closures"]["active"]["number"] >= 5
+
+
+def test_nanomodems_refuse_the_papers_frames_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = ["demo", "--modems", "nanomodem", "--set", "duration_min=1", "--out", str(tmp_path)]
+    assert main(run) == 2
+    error = capsys.readouterr().err
+    assert "profile paper has frames of 256 bytes, this modem carries 62; take profile" in error
+    assert error.count("\n") == 1

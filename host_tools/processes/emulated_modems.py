@@ -86,11 +86,14 @@ class ModemNode(RemoteNode):
         super().answer(done)
 
     def _read(self, announced: list[int]) -> None:  # noqa: ARG002
-        """Take as many bytes as the process has written, and let the modem have them."""
+        """Take as many bytes as the process has written, and let the modem have them.
+
+        What has not come by then went with a port that was pulled.
+        """
         wanted = self._written_bytes - self._read_bytes
-        _wait(lambda: self.port.waiting_bytes()[1] >= wanted)
+        _wait(lambda: self.port.fileno is None or self.port.waiting_bytes()[1] >= wanted)
         data = self.port.read()
-        self._read_bytes += len(data)
+        self._read_bytes = self._written_bytes
         if data:
             self._unit.receive_data(data, self.now_s)
 

@@ -9,7 +9,7 @@ MISSION_SEEDS ?= 200
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo test slow check bench bench-compression reproduce fuzz faults hil wheel clean
+.PHONY: demo test slow coverage check bench bench-compression reproduce fuzz faults hil wheel clean
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -25,6 +25,11 @@ test: $(READY)
 
 slow: $(READY)
 	$(BIN)/python -m pytest -m slow
+
+coverage: $(READY)
+	$(BIN)/python -m pytest tests/protocol tests/modems/test_sealed.py -m "not slow" --quiet \
+		$(addprefix --cov=protocol.,codec crc framing reassembly seal seal_state modems.sealed) \
+		--cov-branch --cov-fail-under=100 --cov-report=term-missing
 
 hil: $(READY)
 	$(BIN)/python -m pytest hil

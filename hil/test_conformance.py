@@ -8,6 +8,7 @@ import pytest
 
 from hil.benches import Ends
 from hil.conftest import OpenEnds
+from hil.mission import BenchMission
 from protocol.codec import decode, encode
 from protocol.modems.dialect_driver import DialectDriver
 from protocol.modems.events import LinkQuality, RangeMeasured
@@ -17,6 +18,8 @@ from protocol.timestamps import one_way_travel_time_s, to_tx_second
 Record = Callable[[str, object], None]
 """Of pytest: what --junitxml keeps of a run, as the day's record."""
 READY_S = 20.0
+MISSION_S = 300.0
+"""Within this two sub-maps have been measured, fitted and sent, and one was answered."""
 PACKET_S = 12.0
 """Within this a packet has been loaded, has waited for its second, has sounded and been told."""
 
@@ -183,3 +186,16 @@ def test_t07_submap_and_answer(open_ends: OpenEnds) -> None:
     bodies = [getattr(decode(event.frame), "body", b"") for event in ends.heard[1]]
     assert bodies == [getattr(decode(frame), "body", b"") for frame in sent]
     assert decode(ends.heard[0][0].frame).header.submap == 40
+
+
+def test_t08_mission(open_ends: OpenEnds, record_testsuite_property: Record) -> None:
+    """The vehicles' own programs: sub-maps placed by the leader, answers used by the follower."""
+    ends = ready(open_ends(0.14))
+    mission, end_s = BenchMission(ends.bench), ends.bench.now_s + MISSION_S
+    while ends.bench.now_s < end_s and not mission.is_done():
+        mission.step()
+    leader, follower = mission.status()
+    told = {name: count for name, count in {**leader, **follower}.items() if count}
+    record_testsuite_property(f"T08 {ends.bench.facts.kind}", told)
+    assert mission.is_done(), told
+    assert not any(name.endswith("_failed") for name in told), told

@@ -158,9 +158,10 @@ class FatedJournal(Journal):
 
     def abandon(self, files: dict[Path, bytes] | None = None) -> None:
         """Leave the files as a dead process does, what waits is lost, the lock is free."""
+        is_torn = files is not None  # and the death is still to come
         files = self._snapshot() if files is None else files
         self._close()
-        if self._fate.struck is Fault.STORE_CORRUPT:
+        if self._fate.struck is Fault.STORE_CORRUPT and not is_torn:
             files = {path: self._fate.damage(data) for path, data in files.items()}
             self._fate.fired(Fault.STORE_CORRUPT)
         for path, data in files.items():

@@ -7,7 +7,7 @@ from pathlib import Path
 from host_tools.processes.voyage import Voyage
 from protocol.errors import ConfigError
 from protocol.modems.sealed import SealedLink
-from protocol.seal import Opener, Sealer
+from protocol.seal import Blake2sSuite, Opener, Sealer, Suite
 from protocol.seal_state import FileMarks, ReservedCounter, load_keys
 from protocol.settings import replace
 
@@ -15,13 +15,14 @@ COUNTER_ZERO_UTC_S = 1_735_689_600
 """2025-01-01: counters of a store without any begin at the seconds since then; 32 bits last."""
 
 
-def seal_of(vehicle: int, key: Path, store: Path | None) -> SealedLink:
-    """Return the seal of a vehicle.
+def seal_of(vehicle: int, key: Path, store: Path | None, *, encrypts: bool = False) -> SealedLink:
+    """Return the seal of a vehicle; one that encrypts hides what frames say.
 
     Raises
     ------
     ConfigError
-        For a key file that cannot be used, and without a store: counters must outlive a crash.
+        For a key file that cannot be used, without a store: counters must outlive a crash; and
+        for encryption where its library is not installed.
     """
     keys = load_keys(key)
     if store is None:
@@ -29,7 +30,14 @@ def seal_of(vehicle: int, key: Path, store: Path | None) -> SealedLink:
     floor = max(0, int(time.clock_gettime(time.CLOCK_REALTIME)) - COUNTER_ZERO_UTC_S)
     counter = ReservedCounter(store / f"seal_{vehicle}.counter", floor=floor)
     marks = FileMarks(store / f"seal_{vehicle}.marks")
-    return SealedLink(Sealer(keys, counter), Opener(vehicle, keys, marks))
+    suite = _aes() if encrypts else Blake2sSuite()
+    return SealedLink(Sealer(keys, counter, suite), Opener(vehicle, keys, marks, suite))
+
+
+def _aes() -> Suite:
+    from protocol.seal_aes import AesCcmSuite  # noqa: PLC0415  (needs an extra)
+
+    return AesCcmSuite()
 
 
 def sealed_voyage(voyage: Voyage) -> Voyage:

@@ -73,11 +73,13 @@ def run_vehicle(
     start: str,
     store: Path | None = None,
     key: Path | None = None,
+    *,
+    encrypts: bool = False,
 ) -> None:
     """Run one vehicle from its clock's first tick to its last, and write its files."""
     if store is not None:
         prepare_store(store)
-    seal = None if key is None else seal_of(vehicle, key, store)
+    seal = None if key is None else seal_of(vehicle, key, store, encrypts=encrypts)
     sealed = voyage if seal is None else sealed_voyage(voyage)
     is_at_sea = store is not None and any(store.glob("*.sqlite"))
     modem, clock = _modem_and_clock(
@@ -294,6 +296,9 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--key", type=Path, metavar="FILE", help="seal all frames with this key; needs --store"
     )
+    parser.add_argument(
+        "--encrypt", action="store_true", help="with --key: hide what frames say too (AES-CCM)"
+    )
     add_voyage_arguments(parser)
 
 
@@ -318,7 +323,11 @@ def _run_leader(arguments: argparse.Namespace) -> None:
 
 def _run(vehicle: int, arguments: argparse.Namespace, voyage: Voyage) -> None:
     a = arguments
-    run_vehicle(vehicle, a.modem, a.clock, voyage, a.out, a.start, a.store, a.key)
+    if a.encrypt and a.key is None:
+        raise ConfigError("--encrypt needs --key FILE, and the same at every vehicle")
+    run_vehicle(
+        vehicle, a.modem, a.clock, voyage, a.out, a.start, a.store, a.key, encrypts=a.encrypt
+    )
 
 
 FOLLOWER = Command(

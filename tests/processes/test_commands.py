@@ -16,10 +16,12 @@ from firmware.clock import WallClock
 from host_tools.cli import main
 from host_tools.emulators.ptys import PseudoPort
 from host_tools.processes.demo import Crew
+from host_tools.processes.sealing import seal_of
 from host_tools.processes.vehicle import start_time_s
-from protocol.codec import decode
+from protocol.codec import decode, encode
 from protocol.errors import ConfigError
 from protocol.packets import SealedFrame
+from tests.protocol.strategies import paper_packet
 
 SHORT = ["--seed", "5", "--set", "duration_min=2.5", "--set", "beams=32"]
 SHORT += ["--set", "follower_duration_min=2"]
@@ -148,6 +150,32 @@ def test_a_key_that_cannot_be_used_is_one_line(
     assert error.count("\n") == 1
 
 
+def test_encryption_without_a_key_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["leader", "--modem", "serial:///x", "--encrypt", *SHORT]) == 2
+    error = capsys.readouterr().err
+    assert "--encrypt needs --key FILE" in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("leader_encrypts", [True, False])
+def test_a_vehicle_that_encrypts_is_understood_by_those_that_do(
+    tmp_path: Path, leader_encrypts: bool
+) -> None:
+    key, store = tmp_path / "key", tmp_path / "store"
+    key.write_text("5a" * 32)
+    key.chmod(0o600)
+    store.mkdir()
+    plain = encode(paper_packet())
+    shown, hidden = (seal_of(1, key, store, encrypts=does).seal(plain) for does in (False, True))
+    assert shown is not None
+    assert hidden is not None
+    assert plain[60:120] in shown
+    assert plain[60:120] not in hidden
+    leader = seal_of(0, key, store, encrypts=leader_encrypts)
+    assert (leader.open(hidden) is not None) == leader_encrypts
+    assert leader.counters["rejected_tag"] == (not leader_encrypts)
+
+
 def test_a_start_is_a_whole_second_of_utc() -> None:
     assert start_time_s("1970-01-02T00:00:00Z") == 86_400.0
     assert start_time_s("1970-01-01T12:00:00") == 43_200.0
@@ -165,7 +193,7 @@ def test_a_start_is_a_whole_second_of_utc() -> None:
         ["lattice"],
         ["lattice", "--set", "follower.compression.small_frames=1"],
     ],
-    ids=lambda profile: f"{profile[0]}-{len(profile)}",
+    ids=["paper-encrypted", "dense", "lattice", "lattice-small"],
 )
 def test_two_processes_with_a_key_map_together_in_every_profile(
     tmp_path: Path, profile: list[str]
@@ -184,6 +212,7 @@ def test_two_processes_with_a_key_map_together_in_every_profile(
     def vehicle(name: str, port: str) -> "subprocess.Popen[bytes]":
         at = ["--modem", f"serial://{ports}/{port}", "--clock", f"unix://{ports}/clock"]
         sealed = ["--key", str(key), "--store", str(tmp_path / name)]
+        sealed += ["--encrypt"] if profile == ["paper"] else []
         return subprocess.Popen([*program, name, *at, *sealed, *mission])
 
     while not (ports / "follower-1").exists():

@@ -221,7 +221,7 @@ class MissionTrial:
                 excused.add(Fault.DISK_FULL)
             if not excused and fate.struck not in _SPOILERS:
                 self.violations.append(f"vehicle {vehicle} lost its store after {fate.struck}")
-        elif taken(core) < owed and fate.struck not in _SPOILERS:  # a log's damaged end is dropped
+        elif taken(core) < owed and fate.struck is not Fault.STORE_CORRUPT:  # a damaged log is cut
             lost = owed - taken(core)
             self.violations.append(f"vehicle {vehicle} lost {lost} frames that it acknowledged")
 

@@ -9,8 +9,6 @@ that may be lost, beside what the soundings' noise leaves anyway.
 
 from math import comb
 
-import numpy as np
-
 from firmware.compression.lattice import LatticeCode, chosen_protection, missing_m2
 from firmware.compression.settings import CompressionSettings
 
@@ -25,8 +23,7 @@ def chosen_frames(code: LatticeCode, columns: int, most: int, settings: Compress
     """
     loss = settings.expected_loss
     nodes = code.field.frame.rows * code.field.frame.columns
-    gain = code.field.spectrum_m2 / (code.field.spectrum_m2 + code.field.noise_m2)
-    unknown_m2 = float(np.mean(gain)) * code.field.noise_m2
+    unknown_m2 = code.field.unknown_m2
 
     def error_m2(frames: int) -> float:
         protection = chosen_protection(code.progress, columns, frames, settings)

@@ -5,16 +5,16 @@ coefficients a ~ N(0, lambda(k)) and cells y = S z + noise, z = C' a, the poster
 
     (1 / lambda + C S' W S C') a = C S' W y
 
-by conjugate gradients, preconditioned by lambda. lambda itself is found from the same soundings by
-expectation maximisation, smooth in frequency. Gaps, ragged edges and outer-beam noise are in S and
-W; nothing needs to be filled in beforehand.
+by conjugate gradients, preconditioned by its diagonal. lambda itself is found from the same
+soundings by its marginal likelihood: rings of frequency, and what stands out of them where it
+surely does. Gaps, ragged edges and outer-beam noise are in S and W; nothing needs to be filled in
+beforehand.
 """
 
 from collections.abc import Generator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import dctn, idctn
 from scipy.ndimage import gaussian_filter
 from scipy.sparse import csr_array
@@ -23,11 +23,17 @@ from firmware.compression.lattice_frame import LatticeFrame, interpolation
 from firmware.geometry import Array
 from firmware.submaps import BinnedSoundings
 
-_ROUNDS = 10  # of expectation maximisation; more gains under 2 % of the error
-_CG_STEPS = 30  # per round, warm-started
+_ROUNDS = 10  # of scoring; more change the error by less than 1 %
+_CG_STEPS = 12  # per round, warm-started; twice as many at the end
 _CG_TOLERANCE = 1e-8  # of the right side's norm, squared; looser stops before fine detail
-_STRIDE = 1.8  # over-relaxation; plain steps take three times as many rounds on smooth bottoms
-_RADII = 14  # rings of the isotropic part of the spectrum
+_RINGS = 11  # of the isotropic part of the spectrum, evenly spaced in log frequency
+_PROBES = 8  # that tell how much the cells say of each coefficient
+_PROBE_SIGMA = 4.0  # coefficients over which that is the same
+_LOCAL_SIGMA = 2.0  # coefficients over which the spectrum may stand out of its ring
+_LOCAL_DOUBT = 3.0  # coefficients, well measured, that it takes to make it do so
+_LARGEST_TURN = 1.5  # of a log spectrum in a round
+_SHY = 1.03  # on the information: a spectrum too low costs less than one too high
+_SMALLEST_M2 = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,6 +45,7 @@ class Field:
     coefficients_m: Array
     spectrum_m2: Array
     noise_m2: float  # of the mean of a cell, typical
+    unknown_m2: float  # of the depth at a node, that the cells leave
 
     def depth_m(self, position_m: Array) -> Array:
         """Return the depth at positions (N, 2)."""
@@ -91,34 +98,30 @@ def fitted_field_steps(
     bins: BinnedSoundings, frame: LatticeFrame, trend: "Trend"
 ) -> Generator[None, None, Field]:
     """Estimate field and spectrum in small steps; the generator's value is the `Field`."""
-    position_m = np.column_stack([bins.north_m, bins.east_m])
-    read = interpolation(frame, position_m)
-    spread = read.T.tocsr()
-    yield
     variance_m2 = _noise_of_means(bins)
-    weight = 1.0 / variance_m2
-    depth_m = bins.depth_m - trend.depth_m(frame.nodes_of(position_m), frame)
+    cells = _Cells.of(bins, frame, trend, 1.0 / variance_m2)
+    yield
     radius = wavenumbers(frame)
-    ring = _rings(radius)
-    variance = max(float(np.var(depth_m)), 1e-6)
-    prior = _normalised(1.0 / (1.0 + (radius * 60.0) ** 3), variance)
-    covered = np.count_nonzero(np.diff(spread.indptr))
-    share = min(covered / (frame.rows * frame.columns), 1.0)
-    seen = weight.sum() / covered
+    rings = _Rings(radius)
+    information = cells.information()
+    yield
+    spread_m2 = max(float(np.var(cells.depth_m)), 1e-6)
+    prior = _normalised(1.0 / (1.0 + (radius * 60.0) ** 3), spread_m2)
     coefficients = np.zeros(frame.shape)
     for _ in range(_ROUNDS):
-        coefficients = yield from _posterior(
-            read, spread, weight, depth_m, prior, coefficients, frame
-        )
-        energy = coefficients**2 + (1.0 - share) * prior + share * prior / (1.0 + prior * seen)
-        prior = prior * (_smooth(energy, ring) / prior) ** _STRIDE
+        coefficients = yield from cells.posterior(prior, information, coefficients, _CG_STEPS)
+        told = cells.share * prior * information / (1.0 + prior * information)
+        prior = np.maximum(prior * np.exp(rings.turn(coefficients**2 / prior, told)), _SMALLEST_M2)
         yield
+    coefficients = yield from cells.posterior(prior, information, coefficients, 2 * _CG_STEPS)
+    unknown = prior / (1.0 + prior * information * cells.share)
     return Field(
         frame=frame,
         trend=trend,
         coefficients_m=coefficients,
         spectrum_m2=prior,
         noise_m2=float(np.median(variance_m2)),
+        unknown_m2=float(unknown.mean()),
     )
 
 
@@ -152,59 +155,114 @@ def _noise_of_means(bins: BinnedSoundings) -> Array:
     return np.maximum(np.maximum(pooled, 0.25 * single) / bins.count, 1e-8)
 
 
-def _posterior(
-    read: csr_array,
-    spread: csr_array,
-    weight: Array,
-    depth_m: Array,
-    prior: Array,
-    start: Array,
-    frame: LatticeFrame,
-) -> Generator[None, None, Array]:
-    """Return the posterior mean of the coefficients by conjugate gradients on a / sqrt(prior)."""
-    root = np.sqrt(prior)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Cells:
+    """The cells about the trend, how the nodes give them and how well each is known."""
 
-    def gathered(values: Array) -> Array:
-        nodes = spread @ (weight * values)
-        return root * dctn(nodes.reshape(frame.shape), norm="ortho")
+    frame: LatticeFrame
+    read: csr_array
+    spread: csr_array
+    weight: Array
+    depth_m: Array
+    share: float  # of the frame's nodes that any cell touches
 
-    def times(x: Array) -> Array:
-        return x + gathered(read @ idctn(root * x, norm="ortho").ravel())
+    @classmethod
+    def of(
+        cls, bins: BinnedSoundings, frame: LatticeFrame, trend: "Trend", weight: Array
+    ) -> "_Cells":
+        position_m = np.column_stack([bins.north_m, bins.east_m])
+        read = interpolation(frame, position_m)
+        spread = read.T.tocsr()
+        covered = np.count_nonzero(np.diff(spread.indptr))
+        return cls(
+            frame=frame,
+            read=read,
+            spread=spread,
+            weight=weight,
+            depth_m=bins.depth_m - trend.depth_m(frame.nodes_of(position_m), frame),
+            share=min(covered / (frame.rows * frame.columns), 1.0),
+        )
 
-    right = gathered(depth_m)
-    x = start / root
-    residual = right - times(x)
-    direction, squared = residual.copy(), float(np.vdot(residual, residual))
-    enough = _CG_TOLERANCE * float(np.vdot(right, right))
-    for step in range(_CG_STEPS):
-        if squared <= enough:
-            break
-        image = times(direction)
-        length = squared / float(np.vdot(direction, image))
-        x += length * direction
-        residual -= length * image
-        before, squared = squared, float(np.vdot(residual, residual))
-        direction = residual + (squared / before) * direction
-        if step % 4 == 3:
-            yield
-    return root * x
+    def _gathered(self, values: Array) -> Array:
+        nodes = self.spread @ values
+        return np.asarray(dctn(nodes.reshape(self.frame.shape), norm="ortho"))
+
+    def information(self) -> Array:
+        """Return the inverse variance with which the cells tell each coefficient, (rows, columns).
+
+        That is the diagonal of C S' W S C' over the share measured. Its high frequencies are told
+        less well: where a cell lies between nodes, they hardly reach it.
+        """
+        rng = np.random.default_rng(1)  # probes need no other chance than their own
+        root = np.sqrt(self.weight)
+        total = np.zeros(self.frame.shape)
+        for _ in range(_PROBES):
+            total += self._gathered(root * rng.standard_normal(root.size)) ** 2
+        smooth = gaussian_filter(total / _PROBES, _PROBE_SIGMA, mode="reflect")
+        return np.asarray(np.maximum(_SHY * smooth / self.share, 1e-12))
+
+    def posterior(
+        self, prior: Array, information: Array, start: Array, most: int
+    ) -> Generator[None, None, Array]:
+        """Find the posterior mean of the coefficients from a start in so many steps."""
+        nearly = 1.0 / (1.0 / prior + information)
+
+        def times(x: Array) -> Array:
+            seen = self.weight * (self.read @ idctn(x, norm="ortho").ravel())
+            return x / prior + self._gathered(seen)
+
+        right = self._gathered(self.weight * self.depth_m)
+        x, residual = start.copy(), right - times(start)
+        inner = nearly * residual
+        direction, squared = inner.copy(), float(np.vdot(residual, inner))
+        enough = _CG_TOLERANCE * float(np.vdot(right, nearly * right))
+        for step in range(most):
+            if squared <= enough:
+                break
+            image = times(direction)
+            length = squared / float(np.vdot(direction, image))
+            x += length * direction
+            residual -= length * image
+            inner = nearly * residual
+            before, squared = squared, float(np.vdot(residual, inner))
+            direction = inner + (squared / before) * direction
+            if step % 4 == 3:
+                yield
+        return x
 
 
-def _rings(radius: Array) -> NDArray[np.intp]:
-    smallest = float(radius[radius > 0].min())
-    edges = np.geomspace(smallest, float(radius.max()) * 1.001, _RADII)
-    return np.asarray(np.digitize(radius, edges), dtype=np.intp)
+class _Rings:
+    """Frequencies between rings evenly spaced in their logarithm, and steps of a spectrum there.
 
+    Fisher scoring on log lambda: what a coefficient's square says beyond its expectation, over how
+    much it can say. Where the cells tell nothing above their noise, a step takes the spectrum down
+    by a factor of e, and expectation maximisation would hardly move it.
+    """
 
-def _smooth(energy: Array, ring: NDArray[np.intp]) -> Array:
-    """Return a spectrum smooth in frequency: rings, and what stands out of them locally."""
-    count = np.bincount(ring.ravel(), minlength=_RADII + 1)
-    total = np.bincount(ring.ravel(), energy.ravel(), _RADII + 1)
-    level = total / np.maximum(count, 1)
-    isotropic = level[ring]
-    local = gaussian_filter(energy / np.maximum(isotropic, 1e-12), 2.0, mode="reflect")
-    return np.asarray(np.maximum(isotropic * np.clip(local, 0.1, 30.0), 1e-9))
+    def __init__(self, radius: Array) -> None:
+        lowest = float(radius[radius > 0].min())
+        at = np.log(np.maximum(radius, lowest) / lowest)
+        at *= (_RINGS - 1) / max(float(at.max()), 1e-9)
+        self._ring = np.minimum(at.astype(np.intp), _RINGS - 2)
+        self._part = at - self._ring
+
+    def _sums(self, values: Array) -> Array:
+        ring, part = self._ring.ravel(), self._part.ravel()
+        above = values.ravel() * part
+        below = np.bincount(ring, values.ravel() - above, _RINGS)
+        return np.asarray(below + np.bincount(ring + 1, above, _RINGS), dtype=np.float64)
+
+    def turn(self, power: Array, told: Array) -> Array:
+        """Return the change of the log spectrum, for a^2 / lambda and the share of each told."""
+        excess, weight = power - told, told * told
+        level = self._sums(excess) / (self._sums(weight) + 1e-3)
+        level = np.clip(level, -_LARGEST_TURN, _LARGEST_TURN)
+        out = level[self._ring] * (1.0 - self._part) + level[self._ring + 1] * self._part
+        local = gaussian_filter(excess - weight * out, _LOCAL_SIGMA, mode="reflect")
+        local /= gaussian_filter(weight, _LOCAL_SIGMA, mode="reflect") + _LOCAL_DOUBT
+        return np.asarray(out + np.clip(local, -_LARGEST_TURN, _LARGEST_TURN))
 
 
 def _normalised(shape: Array, variance_m2: float) -> Array:
-    return np.asarray(np.maximum(shape / shape.sum() * variance_m2 * shape.size, 1e-9))
+    scaled = shape / shape.sum() * variance_m2 * shape.size
+    return np.asarray(np.maximum(scaled, _SMALLEST_M2))

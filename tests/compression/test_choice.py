@@ -14,8 +14,8 @@ def frames_for(noise_m: float = 0.15, **changes: float) -> int:
     return compress(made_survey(noise_m=noise_m).bins, settings, "auto").fragment_count
 
 
-def test_noisy_soundings_of_smooth_relief_are_worth_few_frames() -> None:
-    assert frames_for(noise_m=0.4) < 6
+def test_noisy_soundings_are_worth_fewer_frames() -> None:
+    assert frames_for(noise_m=1.0) < frames_for(noise_m=0.05) < 10
 
 
 def test_more_loss_takes_more_frames() -> None:

@@ -39,9 +39,11 @@ def calibrated(
     count = bins.count[::every]
     spread = bins.variance_m2[::every] * np.maximum(count - 1.0, 0.0)
     residual_m = bins.depth_m[::every] - depth_m
-    squared = without_tail(spread + residual_m**2)
+    every_squared = spread + residual_m**2
+    squared = without_tail(every_squared)
     c, sigma2 = _fitted(posterior, squared, count)
-    wider = widening(squared / (c * posterior + sigma2), count)
+    told = c * posterior + sigma2
+    wider = max(widening(squared / told, count), heaviness(every_squared / told))
     c, sigma2 = wider * c, wider * sigma2
     calibrated_hyper = Hyperparameters(
         b_per_m=hyper.b_per_m,
@@ -78,6 +80,14 @@ def without_tail(squared: Array) -> Array:
     """
     out: Array = np.minimum(squared, _TAIL * max(float(np.median(squared)), _SMALLEST_M2))
     return out
+
+
+def heaviness(ratio: Array) -> float:
+    """Return the factor on the variance that 95 % of the cells ask for, whatever their tail.
+
+    More than a few wild cells are no accident of one place, and the map has to admit them.
+    """
+    return float(np.quantile(ratio, 0.95)) / 1.96**2
 
 
 def widening(ratio: Array, count: Array) -> float:

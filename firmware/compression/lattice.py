@@ -14,7 +14,7 @@ import numpy as np
 
 from firmware.compression import bitplanes
 from firmware.compression.bitplanes import Progress
-from firmware.compression.calibration import widening, without_tail
+from firmware.compression.calibration import heaviness, widening, without_tail
 from firmware.compression.dense import frames_relied_on
 from firmware.compression.field import Field, Trend, fitted_field_steps, fitted_trend, surface_m
 from firmware.compression.footprint import (
@@ -83,7 +83,7 @@ def lattice_code_steps(
         mask=mask,
         code=encoder.finish(),
         progress=progress,
-        residual_m2=_residual_m2(field, bins),
+        residual_m2=_residual_m2(field, bins) + field.unknown_m2,
     )
 
 
@@ -204,9 +204,10 @@ def _residual_m2(field: Field, bins: BinnedSoundings) -> float:
     depth_m = field.trend.depth_m(field.frame.nodes_of(position_m), field.frame)
     depth_m += interpolation(field.frame, position_m) @ surface_m(field.coefficients_m).ravel()
     spread = bins.variance_m2 * np.maximum(bins.count - 1.0, 0.0)
-    squared = without_tail(spread + (bins.depth_m - depth_m) ** 2)
+    every_squared = spread + (bins.depth_m - depth_m) ** 2
+    squared = without_tail(every_squared)
     mean = max(float(np.average(squared, weights=bins.count)), 1e-6)
-    return mean * widening(squared / mean, bins.count)
+    return mean * max(widening(squared / mean, bins.count), heaviness(every_squared / mean))
 
 
 def _geometry(field: Field, variances_m2: list[float]) -> bytes:

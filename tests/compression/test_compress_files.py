@@ -62,7 +62,7 @@ def test_small_frames_of_62_bytes_hold_a_lattice(survey: Survey, tmp_path: Path)
     assert (tmp_path / "frames.bin").stat().st_size == 620
 
 
-# every depth is then less certain than the 0.1 m2 that the leader keeps
+# hardly any depth is then as certain as the 0.1 m2 that the leader keeps
 UNCERTAIN = {"fewer soundings than points", "millimetres across", "cliff of 40 m"}
 
 
@@ -103,7 +103,7 @@ def test_awkward_soundings_give_frames_and_a_grid_or_one_clear_error(
         return
     _, _, depth_m, _ = grid_of(tmp_path, soundings, profile, set())
     finite = depth_m[np.isfinite(depth_m)]
-    assert (finite.size > 0) != (name in UNCERTAIN)
+    assert (finite.size > 0.01 * depth_m.size) != (name in UNCERTAIN)
     assert np.all((finite > 0.0) & (finite < 90.0))
 
 

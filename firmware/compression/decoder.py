@@ -64,7 +64,7 @@ def point_decoder(points_ned_m: Array, hyper: Hyperparameters) -> PointDecoder:
     local_m = points_ned_m[:, :2] - origin_m
     nugget = NUGGET + (hyper.sigma2_m2 / hyper.c_m2 if hyper.noise_applied else 0.0)
     k = correlation(hyper.kernel, squared_distance(local_m, local_m, hyper.b_per_m))
-    lower, nugget, failed = factorised(k, nugget)
+    lower, nugget, failed = factorised(k, nugget, use_up=True)
     del k
     weights_m = cho_solve((lower.T, False), points_ned_m[:, 2] - hyper.mean_depth_m)
     whitener = lapack.dtrtri(lower.T, lower=0, overwrite_c=1)[0]
@@ -79,16 +79,22 @@ def point_decoder(points_ned_m: Array, hyper: Hyperparameters) -> PointDecoder:
     )
 
 
-def factorised(k: Array, nugget: float) -> tuple[Array, float, int]:
+def factorised(k: Array, nugget: float, *, use_up: bool = False) -> tuple[Array, float, int]:
     """Return the lower Cholesky factor of k + nugget I, the nugget it took, and the failures.
 
-    The factor is in the order of rows, so that LAPACK takes its transpose as it is.
+    The factor is in the order of rows, so that LAPACK takes its transpose as it is. It may take the
+    place of k, of which it leaves the upper half alone: from there k is restored after a failure.
     """
+    room = np.asarray(k, dtype=np.float64) if use_up else np.array(k, dtype=np.float64)
+    diagonal = room.diagonal().copy()
     for failed in range(_TRIES):
-        widened = np.array(k, dtype=np.float64)
-        widened[np.diag_indices_from(widened)] += nugget
-        upper, info = lapack.dpotrf(widened.T, lower=0, overwrite_a=1)  # in place, seen as columns
+        room[np.diag_indices_from(room)] = diagonal + nugget
+        upper, info = lapack.dpotrf(room.T, lower=0, overwrite_a=1, clean=0)  # seen as columns
         if info == 0 and np.isfinite(upper[-1, -1]):
+            for row, column in zip(upper.T, range(1, len(k) + 1), strict=True):
+                row[column:] = 0.0
             return upper.T, nugget, failed
+        below = np.tril_indices_from(room, -1)
+        room[below] = room.T[below]
         nugget *= 10.0
     raise EstimationError(f"covariance of {len(k)} points stays singular at a nugget of {nugget} c")

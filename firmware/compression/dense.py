@@ -202,7 +202,7 @@ def _factor(position_m: Array, hyper: Hyperparameters) -> Array:
     """Return the Cholesky factor of the points' correlation, which predicts their depths."""
     about_m = position_m - position_m.mean(axis=0)
     k = correlation(hyper.kernel, squared_distance(about_m, about_m, hyper.b_per_m))
-    return factorised(k, NUGGET)[0]
+    return factorised(k, NUGGET, use_up=True)[0]
 
 
 def _exponent(step_m: float, offset: int) -> int:

@@ -22,7 +22,12 @@ from scipy.linalg import cho_solve, solve_triangular
 
 from firmware.compression.decoder import NUGGET, factorised
 from firmware.compression.kernel_rows import Room, Rows
-from firmware.compression.kernels import Kernel, correlation_and_slope, squared_distance
+from firmware.compression.kernels import (
+    Kernel,
+    correlation,
+    correlation_and_slope,
+    squared_distance,
+)
 from firmware.compression.losses import LossPatterns
 from firmware.geometry import Array
 
@@ -105,6 +110,8 @@ class ExpectedError:
             moment += rows.weighted.T @ rows.target
             if done % self._rows_a_step == 0:
                 yield
+        if not gradient and not self._groups:
+            return self._value(point_m, b, gram, moment)
         inner = yield from self._solved_steps(point_m, b, gram, moment)
         if not gradient:
             return inner.evaluation
@@ -122,31 +129,46 @@ class ExpectedError:
                 yield
         return dataclasses.replace(inner.evaluation, by_position=by_position, by_log_b=by_log_b)
 
+    def _value(self, point_m: Array, b: float, gram: Array, moment: Array) -> Evaluation:
+        """Return the error and the depths without losses, and no gradient: less memory."""
+        k = correlation(self._kernel, squared_distance(point_m, point_m, b))
+        found = self._without_losses(gram, moment, k)
+        return Evaluation(
+            error_m2=found.error_m2,
+            by_position=np.zeros_like(point_m),
+            by_log_b=0.0,
+            depth_m=k @ found.beta,
+        )
+
     def _solved_steps(
         self, point_m: Array, b: float, gram: Array, moment: Array
     ) -> Generator[None, None, "_Inner"]:
         """Return the best weights, their error, and the gradient through the points' own K."""
-        squared = squared_distance(point_m, point_m, b)
-        k, slope = correlation_and_slope(self._kernel, squared, squared)
-        if slope is k:  # which is changed below
-            slope = k.copy()
         if self._groups:
+            squared = squared_distance(point_m, point_m, b)
+            k, slope = correlation_and_slope(self._kernel, squared, squared)
+            if slope is k:  # which is changed below
+                slope = k.copy()
             found = yield from self._under_losses(gram, moment, k)
             by_k = np.add(found.by_k, found.by_k.T)
             by_k *= slope
+            depth_m = k @ found.beta
         else:
-            yield
+            k = correlation(self._kernel, squared_distance(point_m, point_m, b))
             found = self._without_losses(gram, moment, k)
-            by_k = slope
+            depth_m = k @ found.beta
+            yield
+            squared = squared_distance(point_m, point_m, b, gram)  # whose room is free now
+            _, by_k = correlation_and_slope(self._kernel, squared, k, squared)
             by_k *= (2.0 * self._ridge) * found.beta
             by_k *= found.beta[:, None]
-        beta, mass, moved = found.beta, by_k.sum(axis=1), by_k @ point_m
+        mass, moved = by_k.sum(axis=1), by_k @ point_m
         by_scale = mass @ np.sum(point_m**2, axis=1) - float(np.vdot(moved, point_m))
         evaluation = Evaluation(
             error_m2=found.error_m2,
             by_position=(b * b) * (moved - mass[:, None] * point_m),
             by_log_b=-(b * b) * float(by_scale),
-            depth_m=k @ beta,
+            depth_m=depth_m,
         )
         return _Inner(evaluation=evaluation, stack=found.stack, probability=found.probability)
 
@@ -156,7 +178,7 @@ class ExpectedError:
         k *= self._ridge
         gram += k
         k /= self._ridge
-        lower, _, failed = factorised(gram, _ROUNDING * float(np.trace(gram)))
+        lower, _, failed = factorised(gram, _ROUNDING * float(np.trace(gram)), use_up=True)
         self.failed_factorisations += failed
         beta = np.asarray(cho_solve((lower.T, False), moment))
         return _Solution(

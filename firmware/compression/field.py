@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.fft import dctn, idctn
 from scipy.ndimage import gaussian_filter
-from scipy.sparse import csr_array
+from scipy.sparse import csc_array, csr_array
 
 from firmware.compression.lattice_frame import LatticeFrame, interpolation
 from firmware.geometry import Array
@@ -161,7 +161,7 @@ class _Cells:
 
     frame: LatticeFrame
     read: csr_array
-    spread: csr_array
+    spread: csc_array  # its transpose, in the same memory
     weight: Array
     depth_m: Array
     share: float  # of the frame's nodes that any cell touches
@@ -172,12 +172,11 @@ class _Cells:
     ) -> "_Cells":
         position_m = np.column_stack([bins.north_m, bins.east_m])
         read = interpolation(frame, position_m)
-        spread = read.T.tocsr()
-        covered = np.count_nonzero(np.diff(spread.indptr))
+        covered = np.count_nonzero(np.bincount(read.indices))
         return cls(
             frame=frame,
             read=read,
-            spread=spread,
+            spread=read.T,
             weight=weight,
             depth_m=bins.depth_m - trend.depth_m(frame.nodes_of(position_m), frame),
             share=min(covered / (frame.rows * frame.columns), 1.0),

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from firmware.geometry import Array
 
 FloatArray = NDArray[Any]  # float32 for rows over soundings, float64 among points
+_ROWS = 64  # at once where no room is given: matrices among points need none of their own size
 _EXPONENT_FLOOR = -30.0  # below it float32 gets denormal, and denormals are 20-60 times slower
 
 
@@ -27,7 +28,12 @@ class Kernel(enum.IntEnum):
 
 def correlation(kernel: Kernel, squared: FloatArray, spare: FloatArray | None = None) -> FloatArray:
     """Return the correlation at squared scaled distances, which are used up, in their precision."""
-    return correlation_and_slope(kernel, squared, squared, spare)[0]
+    if spare is not None:
+        return correlation_and_slope(kernel, squared, squared, spare)[0]
+    for start in range(0, len(squared), _ROWS):
+        part = squared[start : start + _ROWS]
+        correlation_and_slope(kernel, part, part)
+    return squared
 
 
 def correlation_and_slope(
@@ -77,9 +83,12 @@ def squared_distance(
     """
     squared = np.subtract.outer(left_m[:, 0], right_m[:, 0], out=squared)
     squared *= squared
-    east = np.subtract.outer(left_m[:, 1], right_m[:, 1], out=spare)
-    east *= east
-    squared += east
+    height = _ROWS if spare is None else max(len(squared), 1)
+    for start in range(0, len(squared), height):
+        part = slice(start, start + height)
+        east = np.subtract.outer(left_m[part, 1], right_m[:, 1], out=spare)
+        east *= east
+        squared[part] += east
     squared *= left_m.dtype.type(b * b)
     return squared
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve, lapack
+from scipy.linalg import blas, cho_solve, lapack
 
 from firmware.compression.kernels import Hyperparameters, correlation, squared_distance
 from firmware.geometry import Array
@@ -45,7 +45,7 @@ class PointDecoder:
             squared_distance(local_m, self.points_m, self.hyper.b_per_m, room, more)
             k = correlation(self.hyper.kernel, room, more)
             depth_m[part] = k @ self.weights_m
-            white = np.matmul(k, self.whitener, out=room)
+            white = blas.strmm(1.0, self.whitener.T, k.T, lower=1, overwrite_b=1).T
             explained = np.einsum("ij,ij->i", white, white)
             variance_m2[part] = np.clip(1.0 - explained, 0.0, 1.0)
         return depth_m + self.hyper.mean_depth_m, c * variance_m2 + sigma2

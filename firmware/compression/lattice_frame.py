@@ -98,7 +98,7 @@ def interpolation(frame: LatticeFrame, position_m: Array) -> csr_array:
     nodes = frame.nodes_of(position_m)
     whole = np.floor(nodes).astype(np.int64)
     part = nodes - whole
-    weights = [_cubic(part[:, axis]) for axis in range(2)]
+    weights = [cubic_weights(part[:, axis]) for axis in range(2)]
     rows = np.clip(whole[:, 0, None] + np.arange(-1, 3), 0, frame.rows - 1)
     columns = np.clip(whole[:, 1, None] + np.arange(-1, 3), 0, frame.columns - 1)
     index = rows[:, :, None] * frame.columns + columns[:, None, :]
@@ -108,7 +108,8 @@ def interpolation(frame: LatticeFrame, position_m: Array) -> csr_array:
     return csr_array((values.ravel(), index.ravel(), starts), shape=shape)
 
 
-def _cubic(t: Array) -> Array:
+def cubic_weights(t: Array) -> Array:
+    """Return the weights (..., 4) of the nodes about a place a part t beyond the second."""
     return np.stack(
         [
             ((-0.5 * t + 1.0) * t - 0.5) * t,

@@ -11,8 +11,9 @@ their last bit.
 """
 
 from collections.abc import Generator
+from functools import lru_cache
 from itertools import accumulate
-from math import comb
+from math import gcd
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,9 +79,20 @@ def _odds(count: int, box: Box, first: Box) -> list[int]:
     """Return the running sums of the odds that 0, 1 ... count of the points are in the second."""
     one = first[2] * first[3]
     other = box[2] * box[3] - one
+    common = gcd(one, other)  # leaves the odds as they are, and their numbers short
+    return _running_odds(count, one // common, other // common)
+
+
+@lru_cache(maxsize=64)
+def _running_odds(count: int, one: int, other: int) -> list[int]:
     if count == 1:
         return [0, one, one + other]
-    odds = (comb(count, k) ** 2 * other**k * one ** (count - k) for k in range(count + 1))
+    ways, by_one, by_other = [1], [1], [1]
+    for k in range(count):
+        ways.append(ways[-1] * (count - k) // (k + 1))
+        by_one.append(by_one[-1] * one)
+        by_other.append(by_other[-1] * other)
+    odds = (w * w * a * b for w, a, b in zip(ways, reversed(by_one), by_other, strict=True))
     return [0, *accumulate(odds)]
 
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.spatial import ConvexHull, QhullError
 
-from firmware.compression.decoder import PointDecoder, point_decoder
+from firmware.compression.decoder import point_decoder
 from firmware.compression.dense import dense_points
 from firmware.compression.footprint import inside_footprint
 from firmware.compression.kernels import Hyperparameters
@@ -19,6 +19,7 @@ from firmware.compression.lattice import LatticeMap, lattice_map
 from firmware.compression.mantissa import completed
 from firmware.compression.track_code import decode_track
 from firmware.geometry import Array
+from firmware.leader.gridding import gridded
 from firmware.submaps import GriddedSubmap, Track
 from protocol.errors import EstimationError, RemoteProtocolError
 from protocol.lattice import PROTECTION_BYTES
@@ -181,7 +182,7 @@ def reconstruct_points(
     decoder = point_decoder(points, hyper)
     north_m, east_m = _axes(points[:, :2], settings)
     inside = _inside(points[:, :2], north_m, east_m)
-    depth_m, variance_m2 = _gridded(decoder, north_m, east_m, inside)
+    depth_m, variance_m2 = gridded(decoder, north_m, east_m, inside)
     depth_m[variance_m2 > settings.max_variance_m2] = np.nan
     variance_m2[np.isnan(depth_m)] = np.nan
     return GriddedSubmap(
@@ -226,24 +227,15 @@ def _inside(position_m: Array, north_m: Array, east_m: Array) -> NDArray[np.bool
     return inside
 
 
-def _gridded(
-    decoder: PointDecoder, north_m: Array, east_m: Array, inside: NDArray[np.bool_]
-) -> tuple[Array, Array]:
-    depth_m = np.full(inside.shape, np.nan)
-    variance_m2 = np.full(inside.shape, np.inf)
-    row, column = np.nonzero(inside)
-    depth_m[inside], variance_m2[inside] = decoder.predict(
-        np.column_stack([north_m[row], east_m[column]])
-    )
-    return depth_m, variance_m2
-
-
 def times_of_cells(track: Track, north_m: Array, east_m: Array, wanted: NDArray[np.bool_]) -> Array:
     """Return (R, C) the time of the state nearest to each wanted cell, NaN elsewhere."""
     time_s = np.full(wanted.shape, np.nan)
     if track.time_s.size and wanted.any():
-        row, column = np.nonzero(wanted)
-        states_m = np.column_stack([track.north_m, track.east_m])
-        _, nearest = cKDTree(states_m).query(np.column_stack([north_m[row], east_m[column]]))
-        time_s[wanted] = track.time_s[nearest]
+        nearest_m2 = np.full(wanted.shape, np.inf)
+        for state in zip(track.north_m, track.east_m, track.time_s, strict=True):
+            apart_m2 = (north_m - state[0])[:, None] ** 2 + (east_m - state[1])[None, :] ** 2
+            nearer = apart_m2 < nearest_m2
+            np.copyto(nearest_m2, apart_m2, where=nearer)
+            np.copyto(time_s, state[2], where=nearer)
+        time_s[~wanted] = np.nan
     return time_s

@@ -1,0 +1,57 @@
+"""A decoder's map on a grid: exact on as many nodes as its points can tell apart, cubic between.
+
+A Gaussian process of few points is smooth over a fraction of their spacing, so that on a fine grid
+most of Eq. 5 and 6 would be spent on what the neighbours tell as well.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware.compression.decoder import PointDecoder
+from firmware.compression.fit import spacing_of
+from firmware.compression.lattice_frame import cubic_weights
+from firmware.geometry import Array
+
+_NODES_A_SPACING = 2.4  # at least; what lies between is then within some per cent of sigma
+_LONGEST_STRIDE = 3  # cells
+
+
+def gridded(
+    decoder: PointDecoder, north_m: Array, east_m: Array, inside: NDArray[np.bool_]
+) -> tuple[Array, Array]:
+    """Return depth and variance (R, C) of the cells inside; NaN and infinity elsewhere."""
+    depth_m, variance_m2 = np.full(inside.shape, np.nan), np.full(inside.shape, np.inf)
+    if not inside.any():
+        return depth_m, variance_m2
+    cell_m = float(north_m[1] - north_m[0]) if north_m.size > 1 else np.inf
+    spacing_m = spacing_of(decoder.points_m.astype(np.float64))
+    stride = min(int(spacing_m / (_NODES_A_SPACING * cell_m)), _LONGEST_STRIDE)
+    if stride < 2:
+        row, column = np.nonzero(inside)
+        places_m = np.column_stack([north_m[row], east_m[column]])
+        depth_m[inside], variance_m2[inside] = decoder.predict(places_m)
+        return depth_m, variance_m2
+    along, across = (_between(axis.size, stride) for axis in (north_m, east_m))
+    used = (along != 0.0).T @ inside.astype(np.float64) @ (across != 0.0) > 0.0
+    row, column = np.nonzero(used)
+    nodes_m = np.column_stack(
+        [
+            north_m[0] + cell_m * stride * (row - 1.0),
+            east_m[0] + cell_m * stride * (column - 1.0),
+        ]
+    )
+    nodes = np.zeros((2, *used.shape))
+    nodes[0, used], nodes[1, used] = decoder.predict(nodes_m)
+    depth_m[inside] = (along @ nodes[0] @ across.T)[inside]
+    least_m2 = nodes[1, used].min()
+    variance_m2[inside] = np.maximum(along @ nodes[1] @ across.T, least_m2)[inside]
+    return depth_m, variance_m2
+
+
+def _between(cells: int, stride: int) -> Array:
+    """Return the weights (cells, nodes) of nodes every stride, from one before the first cell."""
+    whole, part = np.divmod(np.arange(cells), stride)
+    weights = np.zeros((cells, int(whole[-1]) + 4))
+    columns = whole[:, None] + np.arange(4)
+    np.put_along_axis(weights, columns, cubic_weights(part / stride), axis=1)
+    return weights

@@ -39,6 +39,7 @@ class Window:
     track: Track
     grid_m: Array  # (P, 2)
     true_m: Array  # (P,)
+    depth_of: Callable[[Array], Array]
 
 
 def windows(per_site: int, seed: int) -> Iterator[Window]:
@@ -92,6 +93,7 @@ def _window(
         ),
         grid_m=grid_m,
         true_m=depth_of(grid_m),
+        depth_of=depth_of,
     )
 
 
@@ -116,9 +118,20 @@ def _soundings(depth_of: Callable[[Array], Array], rng: np.random.Generator) -> 
     for _ in range(20):
         below_m = depth_of(np.column_stack([north_m, range_m * np.sin(angle)]))
         range_m = 0.5 * range_m + 0.5 * below_m / np.cos(angle)
-    range_m = range_m + rng.normal(size=range_m.size) * np.hypot(0.15, 0.003 * range_m)
+    range_m = range_m + rng.normal(size=range_m.size) * _range_sigma_m(range_m)
     east_m, depth_m = range_m * np.sin(angle), range_m * np.cos(angle)
     return np.column_stack([north_m, east_m, depth_m]), time_s
+
+
+def _range_sigma_m(range_m: Array) -> Array:
+    return np.hypot(0.15, 0.003 * range_m)
+
+
+def noise_variance_m2(soundings_ned_m: Array) -> Array:
+    """Return the variance of depth (N,) of soundings from the track, which runs along east = 0."""
+    range_m = np.hypot(soundings_ned_m[:, 1], soundings_ned_m[:, 2])
+    out: Array = (_range_sigma_m(range_m) * soundings_ned_m[:, 2] / range_m) ** 2
+    return out
 
 
 def _fractal(rng: np.random.Generator, slope: float, cell_m: float = 0.5) -> Array:

@@ -10,6 +10,7 @@ from host_tools.scenario import load_scenario
 from protocol.errors import ConfigError
 
 PROFILES = ("paper", "dense", "lattice")
+CHOICES = (*PROFILES, "auto")
 BASELINES = ("none", "unlimited", "octree")
 
 
@@ -54,7 +55,7 @@ def add_mission_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_settings_arguments(parser)
     parser.add_argument("--seed", type=seed, default=1, metavar="N", help="default: 1")
-    parser.add_argument("--profile", choices=PROFILES, default="paper", help="default: paper")
+    parser.add_argument("--profile", choices=CHOICES, default="paper", help="default: paper")
     parser.add_argument("--baseline", choices=BASELINES, default="none", help="default: none")
 
 

@@ -11,7 +11,7 @@ from firmware.compression.settings import BinningSettings, CompressionSettings
 from firmware.geometry import Array
 from firmware.leader.reconstruction import ReconstructionSettings, reconstruct_packets
 from firmware.submaps import Track
-from host_tools.commands import PROFILES, Command
+from host_tools.commands import CHOICES, Command
 from protocol.codec import decode, encode
 from protocol.errors import ConfigError, EstimationError, ProtocolError, RemoteProtocolError
 from protocol.packets import FARTHEST_M, SIZE_BYTES, Header, Profile, SubmapFragment, SubmapPacket
@@ -230,7 +230,7 @@ def _configure_compress(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("soundings", type=Path, metavar="SOUNDINGS.npz")
     parser.add_argument(
         "--profile",
-        choices=(*PROFILES, "auto"),
+        choices=CHOICES,
         default="paper",
         help="default: paper; auto: lattice in as few of the frames as do about as well",
     )

@@ -15,7 +15,10 @@ class FollowerSettings(Settings):
     """Everything that a follower may be told."""
 
     profile: str = setting(
-        "paper", "", "what a sub-map is sent as", choices=("paper", "dense", "lattice")
+        "paper",
+        "",
+        "what a sub-map is sent as; `auto` is `lattice` in as few frames as do about as well",
+        choices=("paper", "dense", "lattice", "auto"),
     )
     frames_per_submap: int | None = setting(
         None,

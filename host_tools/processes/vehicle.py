@@ -89,7 +89,8 @@ def run_vehicle(
     starts = None if files is None else files.prepare()
     try:
         profile = voyage.settings.follower.profile
-        is_small = profile == "lattice" and voyage.settings.follower.compression.small_frames
+        may_be_small = profile in {"lattice", "auto"}
+        is_small = may_be_small and voyage.settings.follower.compression.small_frames
         frame_bytes = SMALL_FRAME_BYTES if is_small else FRAME_BYTES
         check_frame_size(modem.largest_frame_bytes, frame_bytes, profile)
         ticks = clock.ticks(voyage.tick_s)

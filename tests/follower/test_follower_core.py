@@ -91,6 +91,14 @@ def test_number_of_frames_can_be_set() -> None:
     assert {p.header.fragment_count for p in fragments} == {4}
 
 
+def test_auto_sends_each_submap_in_no_more_frames_than_it_is_worth() -> None:
+    fragments = [p for p in sent(follower_of(PATH, profile="auto"), 100.0) if p.header.submap < 2]
+    counts = {p.header.submap: p.header.fragment_count for p in fragments}
+    assert set(counts) == {0, 1}
+    assert all(isinstance(p, SubmapFragment) for p in fragments)
+    assert all(2 <= count < 10 for count in counts.values())
+
+
 def test_paper_profile_in_shared_air_leaves_whole_submaps_out() -> None:
     core = follower_of(PATH, slots=slots_of(2))
     packets = [p for p in sent(core, 200.0) if isinstance(p, SubmapPacket)]

@@ -74,7 +74,7 @@ def trajectory(states: np.ndarray, first_s: float, *, vehicle: int = 1) -> bytes
 
 
 @pytest.mark.parametrize("answers", ["paper", "extended"])
-@pytest.mark.parametrize("profile", ["paper", "dense", "lattice"])
+@pytest.mark.parametrize("profile", ["paper", "dense", "lattice", "auto"])
 def test_every_profile_is_carried_from_sonar_to_answer(profile: str, answers: str) -> None:
     one = convoy(answers=answers, profile=profile).run(0.0, 100.0)
     assert len(sheets_of(one.leader)) >= 2

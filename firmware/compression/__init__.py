@@ -4,13 +4,11 @@ import dataclasses
 from collections.abc import Iterator
 from typing import overload
 
-import numpy as np
-
 from firmware.compression.choice import chosen_frames
 from firmware.compression.dense import dense_code_steps
 from firmware.compression.lattice import lattice_code_steps
 from firmware.compression.packing import filled_bytes, packets_from
-from firmware.compression.points import compress_point_steps, unfitted, usable
+from firmware.compression.points import compress_point_steps, report_of, unfitted, usable
 from firmware.compression.results import (
     CompressedCode,
     CompressedPoints,
@@ -20,6 +18,7 @@ from firmware.compression.results import (
 from firmware.compression.settings import CompressionSettings
 from firmware.compression.track_code import USUAL_TRACK_BYTES
 from firmware.submaps import BinnedSoundings
+from protocol.errors import EstimationError
 from protocol.lattice import PROTECTION_BYTES
 from protocol.packets import Profile
 
@@ -110,8 +109,16 @@ def _dense_steps(bins: BinnedSoundings, settings: CompressionSettings) -> Iterat
     bins = usable(bins)
     best: Compressed = unfitted(bins, settings)
     yield best
-    size = filled_bytes(Profile.SUBMAP_DENSE, settings)
-    for step in dense_code_steps(bins, settings, size):
+    steps = dense_code_steps(bins, settings, filled_bytes(Profile.SUBMAP_DENSE, settings))
+    while True:
+        try:
+            step = next(steps)
+        except StopIteration as stop:
+            ended = str(stop.value)
+            break
+        except EstimationError as error:  # not to be factorised at any nugget
+            ended = str(error)
+            break
         if step is not None:
             code, fitted = step
             best = CompressedCode(
@@ -119,11 +126,7 @@ def _dense_steps(bins: BinnedSoundings, settings: CompressionSettings) -> Iterat
                 fragment_count=settings.frames,
                 code=code,
                 settings=settings,
-                report=FitReport(
-                    evaluations=fitted.evaluations,
-                    failed_factorisations=fitted.failed_factorisations,
-                    ended="running",
-                    expected_rmse_m=float(np.sqrt(max(fitted.error_m2, 0.0))),
-                ),
+                report=report_of(fitted),
             )
         yield best
+    yield dataclasses.replace(best, report=dataclasses.replace(best.report, ended=ended))

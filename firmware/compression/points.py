@@ -185,12 +185,17 @@ def _pack_steps(
         fragment_count=PAPER_FRAGMENTS,
         points_ned_m=wired,
         hyperparameters=hyperparameters,
-        report=FitReport(
-            evaluations=fitted.evaluations,
-            failed_factorisations=fitted.failed_factorisations,
-            ended="running",
-            expected_rmse_m=float(np.sqrt(max(fitted.error_m2, 0.0))),
-        ),
+        report=report_of(fitted),
+    )
+
+
+def report_of(fitted: FittedPoints) -> FitReport:
+    """Return how the fit stands while it goes on."""
+    return FitReport(
+        evaluations=fitted.evaluations,
+        failed_factorisations=fitted.failed_factorisations,
+        ended="running",
+        expected_rmse_m=float(np.sqrt(max(fitted.error_m2, 0.0))),
     )
 
 

@@ -23,6 +23,11 @@ class FitReport:
     ended: str = "not fitted"
     expected_rmse_m: float = float("nan")
 
+    @property
+    def settled(self) -> bool:
+        """Return whether the fit took all of its budget or needed no more."""
+        return self.ended in {"budget", "converged"}
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CompressedPoints:

@@ -195,6 +195,8 @@ class FollowerCore:
         if fit.best is None:
             self.counters["submaps_unfit"] += 1
             return
+        self.counters["failed_factorisations"] += fit.best.report.failed_factorisations
+        self.counters["fits_stopped_early"] += not fit.best.report.settled
         header = Header(
             profile=Profile.SUBMAP_PAPER,
             vehicle=self.vehicle,

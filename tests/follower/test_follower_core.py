@@ -11,6 +11,7 @@ import pytest
 from firmware.follower.core import FollowerCore
 from firmware.soundings import Odometry
 from protocol.codec import decode, encode
+from protocol.errors import EstimationError
 from protocol.packets import (
     Answer,
     ExtendedAnswer,
@@ -97,6 +98,16 @@ def test_auto_sends_each_submap_in_no_more_frames_than_it_is_worth() -> None:
     assert set(counts) == {0, 1}
     assert all(isinstance(p, SubmapFragment) for p in fragments)
     assert all(2 <= count < 10 for count in counts.values())
+
+
+def test_a_fit_that_cannot_go_on_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise EstimationError("singular")
+
+    monkeypatch.setattr("firmware.compression.expected.factorised", refuse)
+    core = follower_of(PATH)
+    assert sent(core, 60.0)
+    assert core.status()["fits_stopped_early"] >= 1
 
 
 def test_paper_profile_in_shared_air_leaves_whole_submaps_out() -> None:

@@ -101,6 +101,71 @@ def dealt_evenly(fragments: int, settings: CompressionSettings) -> Dealer:
     return deal
 
 
+_State = tuple[Array, float, Evaluation]  # positions (M, 2), log b, and what they give
+
+
+class _Search:
+    """Positions and length scale as one vector in spacings and e-folds, and the error there."""
+
+    def __init__(
+        self,
+        frame: FitFrame,
+        start_m: Array,
+        held: int,
+        dealing: Dealing,
+        kernel: Kernel,
+        log_b: float,
+    ) -> None:
+        self._start_m, self._held, self._dealing, self._kernel = start_m, held, dealing, kernel
+        self._spacing_m = spacing_of(start_m)
+        self._lowest = float(np.log(1.0 / (_LONGEST * self._spacing_m)))
+        self._highest = float(np.log(1.0 / (_SHORTEST * self._spacing_m)))
+        self._outline = Outline.of(frame.position_m)
+        self._problem = ExpectedError(
+            frame.position_m,
+            frame.depth_m,
+            frame.weight,
+            kernel,
+            dealing.patterns,
+            dealing.fragment,
+            frame.ridge,
+        )
+        self.start = np.append(np.zeros(2 * (len(start_m) - held)), log_b)
+
+    def _unpacked(self, x: Array) -> tuple[Array, float]:
+        point_m = self._start_m.copy()
+        point_m[self._held :] += self._spacing_m * x[:-1].reshape(-1, 2)
+        return point_m, float(np.clip(x[-1], self._lowest, self._highest))
+
+    def objective(self, x: Array) -> Generator[None, None, Trial[_State]]:
+        """Evaluate the expected error, and the price of points that left the cells' outline."""
+        point_m, log_b = self._unpacked(x)
+        result = yield from self._problem.steps(point_m, log_b)
+        outside, by_outside = self._outline.excess(point_m[self._held :])
+        price = self._problem.total_m2 * _OUTSIDE_PRICE / self._spacing_m**2 / len(point_m)
+        by_position = result.by_position[self._held :] + price * by_outside
+        by_x = np.append(self._spacing_m * by_position.ravel(), result.by_log_b)
+        if not self._lowest < x[-1] < self._highest:
+            by_x[-1] = 0.0
+        value = result.error_m2 + price * outside
+        return Trial(value=value, gradient=by_x, payload=(point_m, log_b, result))
+
+    def fitted(self, step: Improvement[_State]) -> FittedPoints:
+        """Return the points of an improvement."""
+        point_m, log_b, result = step.payload
+        return FittedPoints(
+            position_m=point_m,
+            depth_m=result.depth_m,
+            fragment=self._dealing.fragment,
+            patterns=self._dealing.patterns,
+            b_per_m=float(np.exp(log_b)),
+            kernel=self._kernel,
+            error_m2=step.value,
+            evaluations=step.evaluations,
+            failed_factorisations=self._problem.failed_factorisations,
+        )
+
+
 def fit_steps(
     frame: FitFrame,
     count: int,
@@ -111,53 +176,13 @@ def fit_steps(
     """Yield ever better fits, and None between small steps; the value says why it ended."""
     start_m, held = yield from initial_point_steps(frame.position_m, frame.depth_m, count)
     yield None
-    spacing_m = spacing_of(start_m)
     dealing = deal(start_m)
-    fragment, patterns = dealing.fragment, dealing.patterns
     yield None
-    kernel, log_b = yield from _choose(frame, start_m, fragment, patterns, spacing_m, settings)
-    problem = ExpectedError(
-        frame.position_m, frame.depth_m, frame.weight, kernel, patterns, fragment, frame.ridge
-    )
-    lowest, highest = np.log(1.0 / (_LONGEST * spacing_m)), np.log(1.0 / (_SHORTEST * spacing_m))
-
-    outline = Outline.of(frame.position_m)
-
-    def unpacked(x: Array) -> tuple[Array, float]:
-        point_m = start_m.copy()
-        point_m[held:] += spacing_m * x[:-1].reshape(-1, 2)
-        return point_m, float(np.clip(x[-1], lowest, highest))
-
-    def objective(x: Array) -> Generator[None, None, Trial[tuple[Array, float, Evaluation]]]:
-        point_m, log_b = unpacked(x)
-        result = yield from problem.steps(point_m, log_b)
-        outside, by_outside = outline.excess(point_m[held:])
-        price = problem.total_m2 * _OUTSIDE_PRICE / spacing_m**2 / len(start_m)
-        by_position = result.by_position[held:] + price * by_outside
-        by_x = np.append(spacing_m * by_position.ravel(), result.by_log_b)
-        if not lowest < x[-1] < highest:
-            by_x[-1] = 0.0
-        value = result.error_m2 + price * outside
-        return Trial(value=value, gradient=by_x, payload=(point_m, log_b, result))
-
-    def fitted(step: Improvement[tuple[Array, float, Evaluation]]) -> FittedPoints:
-        point_m, log_b, result = step.payload
-        return FittedPoints(
-            position_m=point_m,
-            depth_m=result.depth_m,
-            fragment=fragment,
-            patterns=patterns,
-            b_per_m=float(np.exp(log_b)),
-            kernel=kernel,
-            error_m2=step.value,
-            evaluations=step.evaluations,
-            failed_factorisations=problem.failed_factorisations,
-        )
-
-    x0 = np.append(np.zeros(2 * (len(start_m) - held)), log_b)
+    kernel, log_b = yield from _choose(frame, start_m, dealing, settings)
+    search = _Search(frame, start_m, held, dealing, kernel, log_b)
     steps = minimise_steps(
-        objective,
-        x0,
+        search.objective,
+        search.start,
         evaluations=max(iterations or settings.iterations, 1),
         first_move=0.2,
         largest_move=0.5,
@@ -167,7 +192,7 @@ def fit_steps(
             step = next(steps)
         except StopIteration as stop:
             return str(stop.value)
-        yield None if step is None else fitted(step)
+        yield None if step is None else search.fitted(step)
 
 
 def moved_steps(
@@ -192,16 +217,12 @@ def moved_steps(
 
 
 def _choose(
-    frame: FitFrame,
-    point_m: Array,
-    fragment: NDArray[np.intp],
-    patterns: LossPatterns,
-    spacing_m: float,
-    settings: CompressionSettings,
+    frame: FitFrame, point_m: Array, dealing: Dealing, settings: CompressionSettings
 ) -> Generator[None, None, tuple[Kernel, float]]:
     """Return the kernel and log b of least expected error at the first points."""
     kernels = list(Kernel) if settings.kernel == "auto" else [Kernel[settings.kernel.upper()]]
     every = max(1, len(frame.depth_m) // _TRIAL_ROWS)
+    spacing_m = spacing_of(point_m)
     best: tuple[float, Kernel, float] = (np.inf, kernels[0], -np.log(spacing_m))
     for kernel in kernels:
         problem = ExpectedError(
@@ -209,8 +230,8 @@ def _choose(
             frame.depth_m[::every],
             frame.weight[::every],
             kernel,
-            patterns,
-            fragment,
+            dealing.patterns,
+            dealing.fragment,
             frame.ridge * every,
         )
         for scale in _START_SCALES:

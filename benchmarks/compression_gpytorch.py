@@ -5,7 +5,9 @@
 Denormals are flushed, without which it is 20 times slower.
 """
 
+# ruff: noqa: ANN401  the types of optional packages are not known here
 import time
+from typing import Any
 
 import numpy as np
 
@@ -32,7 +34,6 @@ def available() -> bool:
 
 def sgpr(window: Window, *, all_soundings: bool, iterations: int = ITERATIONS) -> Coded:
     """Return SGPR with 150 inducing points on all soundings or on the 2 m cells."""
-    import gpytorch  # noqa: PLC0415
     import torch  # noqa: PLC0415
 
     torch.set_flush_denormal(True)
@@ -46,6 +47,26 @@ def sgpr(window: Window, *, all_soundings: bool, iterations: int = ITERATIONS) -
     mean_m = float(depth_m.mean())
     x = torch.tensor(position_m, dtype=torch.float32)
     y = torch.tensor(depth_m - mean_m, dtype=torch.float32)
+    started_s = time.process_time()
+    model = _trained(x, y, torch.tensor(start_m, dtype=torch.float32), iterations)
+    places, depth = _points(model)
+    cpu_s = time.process_time() - started_s
+    hyper = Hyperparameters(
+        b_per_m=1.0 / float(model.base.base_kernel.lengthscale),
+        c_m2=float(model.base.outputscale),
+        sigma2_m2=float(model.likelihood.noise),
+        mean_depth_m=mean_m,
+        kernel=Kernel.SQUARED_EXPONENTIAL,
+    )
+    points = np.column_stack([places, depth + mean_m])
+    decode = points_decoder(window, points, hyper, dealt_fragments(places, 10))
+    return Coded(decode=decode, size_bytes=1816, cpu_s=cpu_s)
+
+
+def _trained(x: Any, y: Any, start: Any, iterations: int) -> Any:
+    """Return the model with inducing points from `start`, after so many steps of Adam."""
+    import gpytorch  # noqa: PLC0415
+    import torch  # noqa: PLC0415
 
     class Model(gpytorch.models.ExactGP):  # type: ignore[misc]
         def __init__(self, likelihood: object) -> None:
@@ -54,9 +75,8 @@ def sgpr(window: Window, *, all_soundings: bool, iterations: int = ITERATIONS) -
             self.base = gpytorch.kernels.ScaleKernel(gpytorch.kernels.RBFKernel())
             self.base.base_kernel.lengthscale = 9.0
             self.base.outputscale = float(y.var())
-            points = torch.tensor(start_m, dtype=torch.float32)
             self.covar_module = gpytorch.kernels.InducingPointKernel(
-                self.base, inducing_points=points, likelihood=likelihood
+                self.base, inducing_points=start, likelihood=likelihood
             )
 
         def forward(self, at: object) -> object:
@@ -64,12 +84,10 @@ def sgpr(window: Window, *, all_soundings: bool, iterations: int = ITERATIONS) -
                 self.mean_module(at), self.covar_module(at)
             )
 
-    started_s = time.process_time()
     likelihood = gpytorch.likelihoods.GaussianLikelihood()
     likelihood.noise = 0.03
     model = Model(likelihood)
     model.train()
-    likelihood.train()
     optimizer = torch.optim.Adam(model.parameters(), lr=0.1)
     objective = gpytorch.mlls.ExactMarginalLogLikelihood(likelihood, model)
     for _ in range(iterations):
@@ -77,20 +95,16 @@ def sgpr(window: Window, *, all_soundings: bool, iterations: int = ITERATIONS) -
         loss = -objective(model(x), y)
         loss.backward()
         optimizer.step()
+    return model
+
+
+def _points(model: Any) -> tuple[Array, Array]:
+    """Return the inducing points (M, 2) and their posterior depths (M,)."""
+    import gpytorch  # noqa: PLC0415
+    import torch  # noqa: PLC0415
+
     model.eval()
-    likelihood.eval()
     points_m = model.covar_module.inducing_points.detach()
     with torch.no_grad(), gpytorch.settings.fast_pred_var():
-        depth = model(points_m).mean.numpy().astype(np.float64)
-    cpu_s = time.process_time() - started_s
-    hyper = Hyperparameters(
-        b_per_m=1.0 / float(model.base.base_kernel.lengthscale),
-        c_m2=float(model.base.outputscale),
-        sigma2_m2=float(likelihood.noise),
-        mean_depth_m=mean_m,
-        kernel=Kernel.SQUARED_EXPONENTIAL,
-    )
-    places: Array = points_m.numpy().astype(np.float64)
-    points = np.column_stack([places, depth + mean_m])
-    decode = points_decoder(window, points, hyper, dealt_fragments(places, 10))
-    return Coded(decode=decode, size_bytes=1816, cpu_s=cpu_s)
+        depth_m = model(points_m).mean.numpy()
+    return points_m.numpy().astype(np.float64), depth_m.astype(np.float64)

@@ -34,6 +34,7 @@ from firmware.geometry import Array
 _STEP_WORK = 10240 * 150**2  # rows x points^2 of a step: under 10 ms
 _ROOM_ROWS = 192 * 150  # rows x points held at once: they stay in the cache
 _KEPT_BYTES = 4 << 20  # of kernel rows between two passes; beyond it they are made twice
+_MANY_POINTS = 200  # whose covariance is a step of its own, and its slope another
 _ROUNDING = 1e-14  # of a Gram matrix in double precision
 
 T = TypeVar("T")
@@ -157,7 +158,8 @@ class ExpectedError:
             k = correlation(self._kernel, squared_distance(point_m, point_m, b))
             found = self._without_losses(gram, moment, k)
             depth_m = k @ found.beta
-            yield
+            if len(point_m) > _MANY_POINTS:
+                yield
             squared = squared_distance(point_m, point_m, b, gram)  # whose room is free now
             _, by_k = correlation_and_slope(self._kernel, squared, k, squared)
             by_k *= (2.0 * self._ridge) * found.beta

@@ -34,7 +34,7 @@ class FollowerSettings(Settings):
     compression: CompressionSettings = setting(CompressionSettings, "", "the fit")
     correction: CorrectionSettings = setting(CorrectionSettings, "", "use of the answers")
     steps_per_tick: int = setting(
-        4, "steps", "of the fit between two pings; a sub-map's fit then ends within 4 s", minimum=1
+        4, "steps", "of the fit between two pings; one of `paper` then ends within 16 s", minimum=1
     )
     track_s: float = setting(
         600.0, "s", "of own track kept to place answers by; they are two minutes old", minimum=60.0

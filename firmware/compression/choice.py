@@ -3,8 +3,8 @@
 Measured (`python -m benchmarks.compression`): whatever the number of frames, `lattice` rebuilds
 with the least error of the three, and unlike them gives some map from any two of its frames.
 `paper` is for receivers that know the paper's packet only. What is left to choose is the number of
-frames, and that the sub-map's own code tells: how much error every byte takes away, over the frames
-that may be lost, beside what the soundings' noise leaves anyway.
+frames (`--profile auto`, aboard too), and that the sub-map's own code tells: how much error every
+byte takes away, over the frames that may be lost, beside what the soundings leave unknown anyway.
 """
 
 from math import comb

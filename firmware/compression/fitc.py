@@ -145,9 +145,10 @@ class _Points:
         self.point_m, self.b, self.c = point_m, b, c
         self.squared = squared_distance(point_m, point_m, b)
         correlation, self.slope_m = correlation_and_slope(kernel, self.squared)
-        lower, nugget, self.failed = factorised(correlation, _JITTER)
+        k_m = c * correlation
+        lower, nugget, self.failed = factorised(k_m / c, _JITTER)
         self.lower = np.sqrt(c) * lower
-        self.k_m = c * correlation + c * nugget * np.eye(len(point_m))
+        self.k_m = k_m + c * nugget * np.eye(len(point_m))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

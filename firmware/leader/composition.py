@@ -22,12 +22,10 @@ from firmware.leader.ledger import (
     Anchor,
     ClosureRecord,
     Entry,
-    OdometryRecord,
     PriorRecord,
     RangeRecord,
     Record,
     SharedDriftRecord,
-    SharedWalkRecord,
 )
 from protocol.settings import Settings, setting
 
@@ -131,7 +129,7 @@ class Composition:
         self._estimate, self._settings = estimate, settings
 
     def coarse(self, ledger: Mapping[int, Entry]) -> Coarse:
-        """Return what stays of a ledger, in order; dead reckoning of dropped nodes is left out."""
+        """Return what stays of a ledger, in order; what joins nodes of a chain is left out."""
         kept: dict[int, Entry] = {}
         closures: dict[tuple[int, int], Group[ClosureRecord]] = defaultdict(list)
         ranges: dict[tuple[int, int], Group[RangeRecord]] = defaultdict(list)
@@ -155,7 +153,7 @@ class Composition:
                         spread_m2 = fix.covariance_m2 + self._apart_m2[anchor.key]
                         record = replace(record, covariance_m2=spread_m2)
                     kept[number] = Entry(record=record, active=entry.active)
-                case record if self._owners.keys().isdisjoint(_nodes_of(record)):
+                case PriorRecord() | SharedDriftRecord() as record:
                     kept[number] = Entry(record=record, active=entry.active)
         new: list[Record] = []
         for range_group in ranges.values():
@@ -273,13 +271,3 @@ def _keep(
         kept[number] = Entry(record=record, active=True)
     elif active:
         new.append(composed([record for _, _, record in active]))
-
-
-def _nodes_of(record: Record) -> tuple[int, ...]:
-    match record:
-        case OdometryRecord():
-            return record.origin, record.target
-        case SharedWalkRecord():
-            return *record.origins, *record.targets
-        case _:
-            return ()

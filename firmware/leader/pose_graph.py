@@ -11,7 +11,7 @@ The ISAM2 object is a cache of the ledger: poisoned as soon as it raises, and re
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -40,13 +40,14 @@ from firmware.leader.ledger import (
 )
 from firmware.leader.solver import new_isam
 from firmware.leader.trajectory import Trajectory
+from firmware.leader.wander import changes_of, likely_walk
 from firmware.submaps import Track
 from protocol.errors import EstimationError
 from protocol.settings import Settings, setting
 
-_Kind = TypeVar("_Kind", bound=Record)
 _RECKONING = (PriorRecord, OdometryRecord, SharedDriftRecord, SharedWalkRecord)
-_PLAIN = ("_settings", "_chains", "_ledger", "_entered", "_factorization", "rebuilds")
+_PLAIN = ("_settings", "_chains", "_ledger", "_entered", "_walk", "_factorization", "rebuilds")
+_POSITION, _BIAS = slice(2), slice(2, 4)  # of a node's state
 _WORN = 1.3
 """ISAM2 eliminates the newest variables last, and fills: so much of that, and it is built anew."""
 
@@ -75,8 +76,15 @@ class GraphSettings(Settings):
     bias_walk: float = setting(
         0.004, "m/s/sqrt(s)", "lets a current of 0.2 m/s turn within an hour", minimum=1e-7
     )
-    bias_walk_apart: float = setting(
-        0.0007, "m/s/sqrt(s)", "a current turns for all vehicles in it alike, nearly", minimum=1e-7
+    walk_factor: float = setting(
+        2.0, "1", "by which that may well be wrong, until the mission tells", minimum=1.01
+    )
+    walk_interval_s: float = setting(
+        300.0, "s", "over which drift is compared to learn it: half a survey line", minimum=60.0
+    )
+    walk_memory_s: float = setting(3600.0, "s", "of drift that is compared", minimum=600.0)
+    walk_apart: float = setting(
+        0.175, "1", "of it is one vehicle's own: a current turns for all in it alike", minimum=1e-3
     )
     alike_interval_s: float = setting(
         60.0, "s", "how often that is said: chains stay loosely coupled", minimum=10.0
@@ -117,6 +125,7 @@ class PoseGraph:
         self._chains: dict[int, Chain] = {}
         self._ledger: dict[int, Entry] = {}
         self._entered = 0
+        self._walk = settings.bias_walk
         self._changed: set[int] = set()
         self._values = gtsam.Values()
         self._fresh = gtsam.Values()
@@ -178,7 +187,7 @@ class PoseGraph:
             first = next(iter(self._chains.values())) if like is None else self._chains[like]
             nearest = first.nearest(time_s)
             gap_s = abs(time_s - first.times_s[nearest])
-            wandered_mps = float(s.bias_walk * np.sqrt(gap_s + s.node_interval_s))
+            wandered_mps = float(self._walk * np.sqrt(gap_s + s.node_interval_s))
             self._enter(
                 SharedDriftRecord(
                     origin=first.keys[nearest],
@@ -325,8 +334,9 @@ class PoseGraph:
         self._forget_solution()
 
     def compose(self, now_s: float, settings: CompositionSettings) -> None:
-        """Make the past coarse, and restart ISAM2 from the ledger and the estimate."""
+        """Make the past coarse, learn how much drift wanders, and restart ISAM2 from the ledger."""
         self.update()
+        self._learn_walk(now_s)
         estimate = {
             key: self._state(key)[:2]
             for chain in self._chains.values()
@@ -349,7 +359,7 @@ class PoseGraph:
         self._factors.clear()
         for record in coarse.new:
             self._enter(record)
-        self._mend()
+        self._join_all()
         values = gtsam.Values()
         for chain in self._chains.values():
             for key in (*chain.keys, chain.parameters):
@@ -408,7 +418,7 @@ class PoseGraph:
             self._newest_covariance[vehicle] = self._isam.marginalCovariance(chain.keys[-1])
         ahead_s = max(time_s - chain.times_s[-1], 0.0)
         carry = np.hstack([np.eye(2), -ahead_s * np.eye(2)])
-        grown_m2 = s.odometry_noise**2 * ahead_s + s.bias_walk**2 * ahead_s**3 / 3
+        grown_m2 = s.odometry_noise**2 * ahead_s + self._walk**2 * ahead_s**3 / 3
         covariance = self._newest_covariance[vehicle]
         return np.asarray(carry @ covariance @ carry.T + grown_m2 * np.eye(2))
 
@@ -490,23 +500,39 @@ class PoseGraph:
         self._join(chain, len(chain.keys) - 1)
 
     def _join(self, chain: Chain, node: int) -> None:
-        s = self._settings
-        self._enter(chain.odometry(node - 1, node, s.odometry_noise, s.bias_walk))
+        noise = self._settings.odometry_noise
+        self._enter(chain.odometry(node - 1, node, noise, self._walk))
 
     def _tie(self, chain: Chain, begin_s: float, end_s: float) -> None:
-        first, apart = next(iter(self._chains.values())), self._settings.bias_walk_apart
+        first, apart = next(iter(self._chains.values())), self._settings.walk_apart * self._walk
         for tie in shared_walk(first, chain, begin_s, end_s, apart):
             self._enter(tie)
 
-    def _joint_covariance(self, keys: list[int]) -> Array:
-        """Return the joint covariance (2K, 2K) in m^2 of the positions of K nodes."""
+    def _joint_covariance(self, keys: list[int], part: slice = _POSITION) -> Array:
+        """Return the joint covariance (2K, 2K) of the positions in m, or biases, of K nodes."""
         self.update()
         try:
             joint = self._isam.jointMarginalCovariance(keys).fullMatrix()
         except RuntimeError as error:
             raise EstimationError("the information matrix is singular") from error
-        rows = (4 * np.arange(len(keys))[:, None] + np.arange(2)).ravel()
+        rows = (4 * np.arange(len(keys))[:, None] + np.arange(4)[part]).ravel()
         return np.asarray(joint[np.ix_(rows, rows)])
+
+    def _learn_walk(self, now_s: float) -> None:
+        """Learn from the first chain, whose wandering all share, how much drift wanders."""
+        s = self._settings
+        chain = next(iter(self._chains.values()))
+        epochs_s = np.arange(chain.times_s[-1], now_s - s.walk_memory_s, -s.walk_interval_s)[::-1]
+        nodes = sorted({chain.nearest(epoch_s) for epoch_s in epochs_s})
+        keys = [chain.keys[node] for node in nodes]
+        if len(keys) < 2:
+            return
+        changes = changes_of(
+            np.array([chain.times_s[node] for node in nodes]),
+            np.array([self._state(key)[2:] for key in keys]),
+            self._joint_covariance(keys, _BIAS),
+        )
+        self._walk = likely_walk(changes, self._walk, s.bias_walk, s.walk_factor)
 
     def _apart(self, owners: Mapping[int, int]) -> dict[int, Array]:
         """Return the covariance (2, 2) of the way between each node and its owner."""
@@ -519,22 +545,15 @@ class PoseGraph:
             apart_m2[key] = joint_m2[a, a] + joint_m2[b, b] - joint_m2[a, b] - joint_m2[b, a]
         return apart_m2
 
-    def _mend(self) -> None:
-        """Say of dead reckoning and shared walks what is not said between nodes that are left."""
-        joined = {r.target for r in self._records(OdometryRecord)}
-        tied = {(r.origins[1], r.targets[1]) for r in self._records(SharedWalkRecord)}
+    def _join_all(self) -> None:
+        """Say anew of the nodes that are left how dead reckoning and the water join them."""
         for chain in self._chains.values():
             for node in range(1, len(chain.keys)):
-                if chain.keys[node] not in joined:
-                    self._join(chain, node)
+                self._join(chain, node)
             alike_s = self._settings.alike_interval_s
-            told = [k for k, time_s in enumerate(chain.times_s) if time_s % alike_s == 0.0]
-            for before, node in itertools.pairwise(told):
-                if (chain.keys[before], chain.keys[node]) not in tied:
-                    self._tie(chain, chain.times_s[before], chain.times_s[node])
-
-    def _records(self, kind: type[_Kind]) -> list[_Kind]:
-        return [e.record for e in self._ledger.values() if isinstance(e.record, kind)]
+            told_s = [time_s for time_s in chain.times_s if time_s % alike_s == 0.0]
+            for before_s, time_s in itertools.pairwise(told_s):
+                self._tie(chain, before_s, time_s)
 
     def _anchor_in_shape(self, vehicle: int, key: int, time_s: float, track: Track) -> Anchor:
         here_m = self.trajectory(vehicle).correct(time_s, track.position_at(time_s))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import pickle
+from typing import TypeVar
 
 import numpy as np
 import pytest
@@ -9,12 +10,19 @@ import pytest
 from firmware.geometry import Array
 from firmware.leader.chains import Chain
 from firmware.leader.composition import CompositionSettings, kept_nodes
-from firmware.leader.ledger import ClosureRecord, OdometryRecord, RangeRecord, SharedWalkRecord
+from firmware.leader.ledger import (
+    ClosureRecord,
+    OdometryRecord,
+    RangeRecord,
+    Record,
+    SharedWalkRecord,
+)
 from firmware.leader.pose_graph import GraphSettings, PoseGraph
 from firmware.submaps import Track
 
 HOURS, LAP_S = 1.5, 400
 SETTINGS = CompositionSettings()
+_Kind = TypeVar("_Kind", bound=Record)
 
 
 def sailed(rng: np.random.Generator, seconds: int, side_m: float) -> tuple[Track, Array]:
@@ -163,7 +171,7 @@ def test_closure_beyond_its_sigmas_is_not_taken_along() -> None:
     voyage.graph.update()
     voyage.graph.compose(3600.0, SETTINGS)
     assert number not in voyage.graph
-    left = voyage.graph._records(ClosureRecord)
+    left = _records(voyage.graph, ClosureRecord)
     state = voyage.graph._state
     misses_m = [
         r.innovation_m(
@@ -179,11 +187,15 @@ def test_closure_beyond_its_sigmas_is_not_taken_along() -> None:
 def test_every_kept_node_is_tied_to_the_one_before(coarse: Voyage) -> None:
     graph = coarse.graph
     for chain in graph._chains.values():
-        steps = {(r.origin, r.target) for r in graph._records(OdometryRecord)}
+        steps = {(r.origin, r.target) for r in _records(graph, OdometryRecord)}
         assert all(pair in steps for pair in zip(chain.keys, chain.keys[1:], strict=False))
-    walks = graph._records(SharedWalkRecord)
+    walks = _records(graph, SharedWalkRecord)
     assert len(walks) >= SETTINGS.distant_s / SETTINGS.piece_s
-    assert 0 < len(graph._records(RangeRecord)) <= 3600 * HOURS / 60
+    assert 0 < len(_records(graph, RangeRecord)) <= 3600 * HOURS / 60
+
+
+def _records(graph: PoseGraph, kind: type[_Kind]) -> list[_Kind]:
+    return [e.record for e in graph._ledger.values() if isinstance(e.record, kind)]
 
 
 def _composed(voyage: Voyage) -> PoseGraph:

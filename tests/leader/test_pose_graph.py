@@ -151,7 +151,7 @@ def test_current_that_turns_for_one_vehicle_turns_for_the_other() -> None:
     drift_m = np.cumsum(np.where(time_s < 900.0, 0.1, -0.1))
     track = Track(time_s=time_s, north_m=drift_m, east_m=0 * time_s, yaw_rad=0 * time_s)
     misses_m = []
-    for settings in (SETTINGS, dataclasses.replace(SETTINGS, bias_walk_apart=1.0)):
+    for settings in (SETTINGS, dataclasses.replace(SETTINGS, walk_apart=250.0)):
         graph = started(track, 1, started(track, 0, PoseGraph(settings)))
         for second in range(0, 1801, 60):
             for vehicle in (0, 1) if second <= 600 else (0,):

@@ -1,0 +1,76 @@
+"""Pairs of sub-maps that a match left open: looked at again once the graph knows their offset.
+
+Where relief is faint a match finds several places, and the prior cannot tell them apart. Other
+closures narrow the prior later; then one place is left, and the pair becomes a closure after all.
+"""
+
+from collections import OrderedDict
+from dataclasses import dataclass, replace
+
+from firmware.leader.atlas import Atlas, Sheet, SheetId
+from firmware.leader.closures import MatchJob
+from firmware.leader.matching import MatchOutcome, NoMatch
+
+_OPEN = (NoMatch.AMBIGUOUS, NoMatch.LOOSE)  # what a narrower prior may decide
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OpenPair:
+    """How well the offset was known at the last look, and the hint that a look left, if any."""
+
+    sigma_m: float
+    hint: int | None = None
+
+
+class OpenPairs:
+    """Open pairs by the sheet that was matched, bounded by the number of such sheets."""
+
+    def __init__(self, capacity: int) -> None:
+        self._capacity = capacity
+        self._of: OrderedDict[SheetId, dict[SheetId, OpenPair]] = OrderedDict()
+
+    def note(self, job: MatchJob, outcome: MatchOutcome) -> None:
+        """Remember a pair that a match left open, forget one that is none; a closure settles it."""
+        pairs = self._of.get(job.target.id, {})
+        if outcome.reason in _OPEN:
+            known = pairs.get(job.origin.id, OpenPair(sigma_m=job.prior_sigma_m))
+            pairs[job.origin.id] = replace(known, sigma_m=job.prior_sigma_m)
+            self._of[job.target.id] = pairs
+        elif outcome.match is None:
+            self.settle(job.origin.id, job.target.id)
+        while len(self._of) > self._capacity:
+            self._of.popitem(last=False)
+
+    def hint(self, origin: SheetId, target: SheetId) -> int | None:
+        """Return the hint that a look at the pair has left, if any."""
+        pair = self._of.get(target, {}).get(origin)
+        return None if pair is None else pair.hint
+
+    def note_hint(self, origin: SheetId, target: SheetId, number: int | None) -> None:
+        """Remember which hint stands for an open pair."""
+        pairs = self._of.get(target, {})
+        if number is not None and origin in pairs:
+            pairs[origin] = replace(pairs[origin], hint=number)
+
+    def settle(self, origin: SheetId, target: SheetId) -> None:
+        """Forget a pair: it was decided."""
+        pairs = self._of.get(target, {})
+        pairs.pop(origin, None)
+        if not pairs:
+            self._of.pop(target, None)
+
+    def next_turn(self, atlas: Atlas) -> tuple[Sheet, list[tuple[Sheet, float]]] | None:
+        """Return the sheet whose turn it is, and its open partners with their sigmas in metres.
+
+        Sheets take turns; one that is matched no more is forgotten. None if none is left.
+        """
+        while self._of:
+            target, pairs = self._of.popitem(last=False)
+            partners = [(atlas[o], pair.sigma_m) for o, pair in pairs.items() if o in atlas]
+            if target in atlas and partners:
+                self._of[target] = pairs
+                return atlas[target], partners
+        return None
+
+    def __len__(self) -> int:
+        return len(self._of)

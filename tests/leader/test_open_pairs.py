@@ -1,0 +1,124 @@
+"""A pair that a match left open is looked at again once its offset is known much better."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from firmware.leader.atlas import Atlas, Sheet, SheetId, sheet_of
+from firmware.leader.closures import ClosureSettings, MatchJob, jobs_again
+from firmware.leader.matching import MatchingSettings, MatchOutcome, NoMatch
+from firmware.leader.open_pairs import OpenPairs
+from firmware.leader.pairing import Calibrations
+from firmware.leader.pose_graph import GraphSettings, PoseGraph
+from firmware.submaps import GriddedSubmap, Track
+
+AMBIGUOUS = MatchOutcome(match=None, reason=NoMatch.AMBIGUOUS)
+UNSETTLED = MatchOutcome(match=None, reason=NoMatch.UNSETTLED)
+
+
+def _sheet(submap: int, time_s: float = 0.0) -> Sheet:
+    shape = (4, 4)
+    grid = GriddedSubmap(
+        north0_m=0.0,
+        east0_m=0.0,
+        cell_m=2.0,
+        depth_m=np.ones(shape),
+        variance_m2=np.full(shape, 0.01),
+        time_s=np.full(shape, time_s),
+    )
+    times_s = time_s + np.arange(3.0)
+    track = Track(time_s=times_s, north_m=times_s, east_m=np.zeros(3), yaw_rad=np.zeros(3))
+    sheet = sheet_of(
+        SheetId(vehicle=0, boot_epoch=0, submap=submap), track, grid, reconstructed=False
+    )
+    assert sheet is not None
+    return sheet
+
+
+def _job(origin: Sheet, target: Sheet, sigma_m: float) -> MatchJob:
+    return MatchJob(
+        origin=origin,
+        target=target,
+        origin_grid=origin.grid,
+        target_grid=target.grid,
+        origin_drift_mps=np.zeros(2),
+        target_drift_mps=np.zeros(2),
+        prior_shift_m=np.zeros(2),
+        prior_covariance_m2=np.diag([1.0, sigma_m**2]),
+        settings=MatchingSettings(),
+    )
+
+
+@pytest.fixture
+def atlas() -> Atlas:
+    atlas = Atlas(8)
+    for submap in range(4):
+        atlas.add(_sheet(submap))
+    return atlas
+
+
+def _sheets(atlas: Atlas) -> list[Sheet]:
+    return list(atlas)
+
+
+def test_ambiguous_pair_stays_open_with_its_sigma_and_its_hint(atlas: Atlas) -> None:
+    first, second, *_ = _sheets(atlas)
+    pairs = OpenPairs(8)
+    pairs.note(_job(first, second, 9.0), AMBIGUOUS)
+    pairs.note_hint(first.id, second.id, 17)
+    pairs.note(_job(first, second, 4.0), AMBIGUOUS)
+    assert pairs.hint(first.id, second.id) == 17
+    assert pairs.next_turn(atlas) == (second, [(first, 4.0)])
+
+
+def test_settled_and_impossible_pairs_are_forgotten(atlas: Atlas) -> None:
+    first, second, third, _ = _sheets(atlas)
+    pairs = OpenPairs(8)
+    for origin in (first, second):
+        pairs.note(_job(origin, third, 9.0), AMBIGUOUS)
+    pairs.settle(first.id, third.id)
+    assert pairs.next_turn(atlas) == (third, [(second, 9.0)])
+    pairs.note(_job(second, third, 3.0), UNSETTLED)
+    assert pairs.next_turn(atlas) is None
+    assert len(pairs) == 0
+
+
+def test_sheets_take_turns_and_shelved_ones_are_left_out(atlas: Atlas) -> None:
+    first, second, third, fourth = _sheets(atlas)
+    pairs = OpenPairs(8)
+    for target in (second, third, fourth):
+        pairs.note(_job(first, target, 9.0), AMBIGUOUS)
+    atlas.shelve(third.id)
+    turns = [pairs.next_turn(atlas) for _ in range(3)]
+    assert [turn[0].id.submap for turn in turns if turn is not None] == [1, 3, 1]
+
+
+def test_oldest_sheets_go_when_there_are_too_many(atlas: Atlas) -> None:
+    first, second, third, fourth = _sheets(atlas)
+    pairs = OpenPairs(2)
+    for target in (second, third, fourth):
+        pairs.note(_job(first, target, 9.0), AMBIGUOUS)
+    assert len(pairs) == 2
+    assert pairs.hint(first.id, second.id) is None
+
+
+def test_only_a_much_better_known_offset_is_worth_a_second_look() -> None:
+    graph, track = PoseGraph(GraphSettings()), _long_track()
+    graph.add_vehicle(0, 0.0, np.zeros(2), np.zeros(2))
+    graph.extend(0, track)
+    graph.update()
+    origin, target = (
+        dataclasses.replace(_sheet(k, time_s), track=track) for k, time_s in ((1, 20.0), (2, 100.0))
+    )
+    settings = ClosureSettings()
+    for then_m, looks in ((1000.0, 1), (1.0, 0)):
+        jobs = jobs_again(
+            target, [(origin, then_m)], graph, settings, Calibrations(MatchingSettings())
+        )
+        assert len(jobs) == looks
+
+
+def _long_track() -> Track:
+    times_s = np.arange(201.0)
+    return Track(time_s=times_s, north_m=times_s, east_m=0 * times_s, yaw_rad=0 * times_s)

@@ -1,0 +1,98 @@
+"""How much drift wanders is learned from the mission, and unknown where nothing tells."""
+
+import numpy as np
+import pytest
+
+from firmware.geometry import Array
+from firmware.leader.composition import CompositionSettings
+from firmware.leader.pose_graph import GraphSettings, PoseGraph
+from firmware.leader.wander import DriftChange, changes_of, likely_walk
+from firmware.submaps import Track
+
+INTERVAL_S = 300.0
+BELIEVED, FACTOR = 0.004, 2.0
+
+
+def _changes(
+    rng: np.random.Generator, walk: float, assumed: float, noise_mps: float, count: int
+) -> list[DriftChange]:
+    """Return changes as a Kalman filter would estimate them that assumes a walk."""
+    prior, noise = assumed**2 * INTERVAL_S, noise_mps**2
+    changes = []
+    for _ in range(count):
+        true_mps = walk * np.sqrt(INTERVAL_S) * rng.standard_normal(2)
+        measured_mps = true_mps + noise_mps * rng.standard_normal(2)
+        gain = prior / (prior + noise)
+        changes.append(
+            DriftChange(
+                interval_s=INTERVAL_S,
+                change_mps=gain * measured_mps,
+                covariance=gain * noise * np.eye(2),
+            )
+        )
+    return changes
+
+
+@pytest.mark.parametrize("walk", [0.0005, 0.002, 0.008])
+@pytest.mark.parametrize("assumed", [0.001, 0.004])
+def test_walk_is_found_whatever_the_estimate_assumed(walk: float, assumed: float) -> None:
+    changes = _changes(np.random.default_rng(5), walk, assumed, noise_mps=0.01, count=200)
+    assert likely_walk(changes, assumed, BELIEVED, FACTOR) == pytest.approx(walk, rel=0.3)
+
+
+def test_without_evidence_the_belief_stays() -> None:
+    blind = DriftChange(
+        interval_s=INTERVAL_S,
+        change_mps=np.zeros(2),
+        covariance=BELIEVED**2 * INTERVAL_S * np.eye(2),
+    )
+    for changes in ([], [blind] * 20):
+        found = likely_walk(changes, BELIEVED, BELIEVED, FACTOR)
+        assert found == pytest.approx(BELIEVED, rel=0.05)
+
+
+def test_little_evidence_moves_it_little() -> None:
+    rng = np.random.default_rng(6)
+    few = likely_walk(_changes(rng, 0.0, BELIEVED, 0.01, 1), BELIEVED, BELIEVED, FACTOR)
+    many = likely_walk(_changes(rng, 0.0, BELIEVED, 0.01, 50), BELIEVED, BELIEVED, FACTOR)
+    assert many < 0.3 * BELIEVED < 0.5 * BELIEVED < few < BELIEVED
+
+
+def test_changes_are_between_successive_epochs() -> None:
+    covariance = np.diag(np.arange(1.0, 7.0))
+    first, second = changes_of(
+        np.array([0.0, 300.0, 500.0]), np.array([[0.0, 0.0], [1.0, 2.0], [1.5, 1.0]]), covariance
+    )
+    assert (first.interval_s, second.interval_s) == (300.0, 200.0)
+    assert np.allclose(second.change_mps, [0.5, -1.0])
+    assert np.allclose(first.covariance, np.diag([1.0 + 3.0, 2.0 + 4.0]))
+
+
+def _laps(current_mps: Array, rng: np.random.Generator) -> PoseGraph:
+    """Return a graph after laps in a current (T, 2), with an absolute fix every two minutes."""
+    time_s = np.arange(len(current_mps), dtype=np.float64)
+    steps_m = current_mps + 0.2 * rng.standard_normal(current_mps.shape)
+    drift_m = np.cumsum(steps_m, axis=0) - steps_m[0]
+    angle = time_s / 60.0
+    true_m = 100.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+    north_m, east_m = (true_m + drift_m).T
+    track = Track(time_s=time_s, north_m=north_m, east_m=east_m, yaw_rad=angle)
+    graph = PoseGraph(GraphSettings())
+    graph.add_vehicle(0, 0.0, true_m[0] + drift_m[0], true_m[0])
+    graph.extend(0, track)
+    for fix_s in range(120, len(time_s), 120):
+        graph.add_absolute(graph.anchor(0, float(fix_s), track), true_m[fix_s], np.eye(2))
+    graph.update()
+    graph.compose(float(time_s[-1]), CompositionSettings())
+    return graph
+
+
+def test_graph_learns_a_turning_current_from_a_steady_one() -> None:
+    time_s = np.arange(3000.0)[:, None]
+    steady_mps = 0.1 * np.ones((3000, 2))
+    turning_mps = 0.2 * np.hstack([np.cos(time_s / 573.0), np.sin(time_s / 573.0)])
+    steady, turning = (
+        _laps(current_mps, np.random.default_rng(7)) for current_mps in (steady_mps, turning_mps)
+    )
+    ahead = [graph.predicted_covariance(0, 2990.0 + 600.0) for graph in (steady, turning)]
+    assert np.trace(ahead[1]) > 4.0 * np.trace(ahead[0])

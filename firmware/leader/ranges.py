@@ -5,19 +5,22 @@ relative position. All true ranges therefore miss the prediction by nearly the s
 stretched one (Eq. 14) misses by a tenth of the range more. The window is explained as a whole: the
 common miss and its rate are found under a mixture of true, stretched and wild ranges, and nothing
 is believed when two explanations compete. The share of stretched ranges is learned over the
-mission, so that 20 % and 80 % are the same problem.
+mission, so that 20 % and 80 % are the same problem. The prediction may be lost, too: else an
+estimate that has gone astray would read every true range as a stretched one, and stay there.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from firmware.geometry import Array
 from protocol.settings import Settings, setting
 
 _WILD_DENSITY = 1e-4  # per metre: multipath from anywhere in the water column
 _GRID_STEP_SIGMAS = 0.5
+_SHARES = np.array([0.05, 0.2, 0.4, 0.6, 0.8, 0.95])
 _LONGEST_GRID = 1000  # half-widths: a kilometre of miss at the usual sigma
 
 
@@ -42,6 +45,16 @@ class RangeSettings(Settings):
     rate_sigma_mps: float = setting(
         0.15, "m/s", "relative drift along the line of sight that is not known yet", minimum=1e-3
     )
+    lost_share: float = setting(
+        0.02, "1", "of belief that the estimate is astray", minimum=1e-6, maximum=0.5
+    )
+    lost_m: float = setting(50.0, "m", "how far predictions miss then", minimum=1.0)
+    joined: int = setting(
+        20, "ranges", "of windows that join while they are not understood", minimum=5
+    )
+    joined_s: float = setting(
+        60.0, "s", "for which drift along the line of sight is a steady rate", minimum=0.0
+    )
     shortest_m: float = setting(5.0, "m", "nearer, the direction says nothing", minimum=0.0)
     longest_m: float = setting(
         10_000.0, "m", "no modem here carries farther", minimum=10.0, maximum=24_000.0
@@ -52,9 +65,7 @@ class RangeSettings(Settings):
     bent_m: float = setting(
         0.5, "m", "bend of a range that hides in its noise (1 m, Eq. 13)", minimum=0.01
     )
-    bent_windows: int = setting(
-        64, "windows", "of 20 s that wait until closures have straightened them", minimum=1
-    )
+    waiting: int = setting(64, "windows", "of 20 s that wait until they are understood", minimum=1)
     certainty: float = setting(
         0.99, "1", "share of belief that one explanation must have", minimum=0.5, maximum=1.0
     )
@@ -87,8 +98,8 @@ class RangeJudge:
     ) -> RangeVerdict:
         """Explain measured (R,) by predicted ranges (R,) at their times (R,).
 
-        The prediction misses by a common amount, whose sigma is prior_sigma_m, and by a rate,
-        because the vehicles' drift may not be known yet.
+        The prediction misses by a common amount, whose sigma is prior_sigma_m unless the estimate
+        is lost, and by a rate, because the vehicles' drift may not be known yet.
         """
         s = self._settings
         sigma_m = float(np.hypot(s.sigma_m, s.window_spread_m))
@@ -96,7 +107,8 @@ class RangeJudge:
         if not np.any(sane):
             return RangeVerdict(true=sane & False, stretched=sane & False, certain=False)
         age_s = time_s - np.mean(time_s[sane])
-        miss_m = _grid(4.0 * prior_sigma_m + 4.0 * sigma_m, sigma_m)
+        lost_m = float(np.hypot(prior_sigma_m, s.lost_m))
+        miss_m = _grid(4.0 * max(prior_sigma_m, 0.5 * lost_m) + 4.0 * sigma_m, sigma_m)
         reach_s = max(float(np.max(np.abs(age_s))), 1e-3)
         rate_mps = _grid(3.0 * s.rate_sigma_mps, sigma_m / reach_s)
         as_true, as_stretched = self._densities(
@@ -104,16 +116,21 @@ class RangeJudge:
             predicted_m[:, None, None] + miss_m[:, None] + age_s[:, None, None] * rate_mps,
             sigma_m,
         )
-        total = as_true + as_stretched + _WILD_DENSITY
-        prior = (miss_m / prior_sigma_m)[:, None] ** 2 + (rate_mps / s.rate_sigma_mps) ** 2
-        score = np.sum(np.log(total[sane]), axis=0) - 0.5 * prior
+        usual = np.exp(-0.5 * (miss_m / prior_sigma_m) ** 2) / prior_sigma_m
+        lost = np.exp(-0.5 * (miss_m / lost_m) ** 2) / lost_m
+        log_prior = np.log((1.0 - s.lost_share) * usual + s.lost_share * lost)
+        score = log_prior[:, None] - 0.5 * (rate_mps / s.rate_sigma_mps) ** 2
+        score += self._log_likelihood(as_true[sane], as_stretched[sane])
         belief = np.exp(score - score.max())
         i, j = divmod(int(np.argmax(score)), score.shape[1])
         near = np.abs(miss_m - miss_m[i]) <= 3.0 * sigma_m
         certain = bool(belief[near].sum() / belief.sum() >= s.certainty)
-        odds = total[:, i, j]
-        true = sane & (as_true[:, i, j] > 0.9 * odds)
-        stretched = sane & (as_stretched[:, i, j] > 0.9 * odds)
+        share = self.stretched_share
+        reads_true = (1.0 - share) * as_true[:, i, j]
+        reads_stretched = share * as_stretched[:, i, j]
+        total = reads_true + reads_stretched + _WILD_DENSITY
+        true = sane & (reads_true > 0.9 * total)
+        stretched = sane & (reads_stretched > 0.9 * total)
         if certain:
             self._seen["true"] += float(np.count_nonzero(true))
             self._seen["stretched"] += float(np.count_nonzero(stretched))
@@ -122,12 +139,25 @@ class RangeJudge:
     def _densities(
         self, measured_m: Array, expected_m: Array, sigma_m: float
     ) -> tuple[Array, Array]:
-        """Return the weighted densities (R, G, V) of each range being true, and being stretched."""
-        share, factor = self.stretched_share, self._settings.outlier_factor
-        scale = 1.0 / (np.sqrt(2 * np.pi) * sigma_m)
+        """Return the densities (R, G, V) of each range if it is true, and if it is stretched."""
+        scale, factor = 1.0 / (np.sqrt(2 * np.pi) * sigma_m), self._settings.outlier_factor
         true = np.exp(-0.5 * ((measured_m - expected_m) / sigma_m) ** 2)
         stretched = np.exp(-0.5 * ((measured_m - factor * expected_m) / sigma_m) ** 2)
-        return (1 - share) * scale * true, share * scale * stretched
+        return scale * true, scale * stretched
+
+    def _log_likelihood(self, as_true: Array, as_stretched: Array) -> Array:
+        """Return the log likelihood (G, V) of all ranges over every share that may be the true one.
+
+        The share is as uncertain as what was seen so far leaves it: a beta distribution.
+        """
+        exponents = self._seen["stretched"] - 1.0, self._seen["true"] - 1.0
+        log_weight = exponents[0] * np.log(_SHARES) + exponents[1] * np.log(1.0 - _SHARES)
+        by_share = [
+            np.sum(np.log((1.0 - share) * as_true + share * as_stretched + _WILD_DENSITY), axis=0)
+            for share in _SHARES
+        ]
+        weighted = np.stack(by_share) + (log_weight - logsumexp(log_weight))[:, None, None]
+        return np.asarray(logsumexp(weighted, axis=0))
 
 
 def _grid(reach: float, sigma: float) -> Array:

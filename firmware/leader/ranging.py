@@ -43,7 +43,7 @@ class Ranging:
         self._settings = settings
         self._judge = RangeJudge(settings)
         self._held: deque[_HeldRange] = deque(maxlen=settings.held)
-        self._bent: dict[int, deque[list[_HeldRange]]] = {}
+        self._waiting: dict[int, deque[list[_HeldRange]]] = {}
 
     def hold(self, chain: int, header: Header, toa_s: float) -> None:
         """Keep the range that a frame's arrival tells, until its sender's track is known.
@@ -71,7 +71,8 @@ class Ranging:
         """Judge, as one window, the held ranges whose both ends are known; enter the good ones.
 
         While the vehicles may lie so far across the line of sight that a range bends, the window
-        waits; once one does not, those that waited are tried again, newest first.
+        waits; while two explanations of it compete, the next one joins it. Once a window is
+        understood, those that wait are tried again, newest first.
         """
         end_s = float(track.time_s[-1])
         ready = [r for r in self._held if r.chain == chain and r.sent_s <= end_s]
@@ -79,16 +80,25 @@ class Ranging:
             return
         self._held = deque((r for r in self._held if r not in ready), self._held.maxlen)
         graph.update()
-        waiting = self._bent.setdefault(chain, deque(maxlen=self._settings.bent_windows))
-        if len(waiting) == waiting.maxlen:
-            self.counters["ranges_given_up"] += len(waiting[0])
-        waiting.append(ready)
+        waiting = self._waiting.setdefault(chain, deque())
+        self._join(waiting, ready)
         while waiting:
             placed = self._placed(waiting[-1], (receiver, receiver_track), (chain, track), graph)
             if placed and not self._enter(placed, graph):
                 return
             waiting.pop()
             graph.update()
+
+    def _join(self, waiting: deque[list[_HeldRange]], ready: list[_HeldRange]) -> None:
+        """Let a window wait, with the newest one if that is recent and there is room; bounded."""
+        s = self._settings
+        near = waiting and ready[0].sent_s - waiting[-1][0].sent_s <= s.joined_s
+        if near and len(waiting[-1]) + len(ready) <= s.joined:
+            waiting[-1].extend(ready)
+        else:
+            waiting.append(ready)
+        if len(waiting) > s.waiting:
+            self.counters["ranges_given_up"] += len(waiting.popleft())
 
     def _placed(
         self,
@@ -119,8 +129,7 @@ class Ranging:
             float(np.hypot(along_m, bent_m)),
         )
         if not verdict.certain:
-            self.counters["ranges_undecided"] += len(placed)
-            return True
+            return False
         for k, p in enumerate(placed):
             if verdict.true[k]:
                 graph.add_range(p.here, p.there, p.range_m, bent_m)

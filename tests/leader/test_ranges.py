@@ -31,7 +31,7 @@ def test_stretched_ranges_are_told_apart_under_both_readings_of_eq_14(share: flo
             used = verdict.true | verdict.stretched
             right += int(np.sum(verdict.stretched[used] == stretched[used]))
             total += int(used.sum())
-    assert total > 500
+    assert total > 400  # of 600; a window that is left undecided is joined by the next
     assert right / total > 0.995
     assert judge.stretched_share == pytest.approx(share, abs=0.06)
 
@@ -66,3 +66,16 @@ def test_window_of_impossible_ranges_alone_is_not_certain() -> None:
         np.full(3, np.nan), np.full(3, 300.0), TIMES_S[:3], 3.0
     )
     assert not verdict.certain
+
+
+def test_lost_prediction_is_told_from_a_window_of_stretched_ranges() -> None:
+    """An estimate that is 30 m off, and sure of 2 m, must not read true ranges as stretched."""
+    judge, rng = RangeJudge(RangeSettings()), np.random.default_rng(10)
+    true_m = np.full(4, 300.0)
+    measured_m = true_m + rng.standard_normal(4)
+    assert not judge.judge(measured_m, true_m - 30.0, TIMES_S[:4], 2.0).certain
+    for _ in range(5):
+        measured_m, predicted_m, stretched = window(rng, 0.2, 30.0)
+        verdict = judge.judge(measured_m, predicted_m, TIMES_S, 2.0)
+        assert verdict.certain
+        assert verdict.stretched.tolist() == stretched.tolist()

@@ -82,6 +82,12 @@ class MatchingSettings(Settings):
     covariance_scale: float = setting(
         1.0, "", "from simulated pairs, so that NEES is 2", minimum=0.1
     )
+    hint_scale: float = setting(
+        2.5, "1", "of a hint's covariance: neighbouring pairs share soundings", minimum=1.0
+    )
+    hint_floor_m: float = setting(
+        3.0, "m", "nearer than so an ambiguous pair places nothing", minimum=0.0
+    )
     hint_gain: float = setting(
         0.5, "", "share of the prior's variance that a hint must leave along some axis", minimum=0.0
     )

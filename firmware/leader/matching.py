@@ -135,8 +135,10 @@ def _hint(
     away = np.where(gained, moved / np.maximum(1.0 - left, 1e-3), 0.0)
     sigmas = np.where(gained, share, _NO_INFORMATION)
     frame = root @ axes
+    told_m2 = problem.settings.hint_scale * frame @ np.diag(sigmas) @ frame.T
     return Hint(
-        shift_m=prior.mean_m + frame @ away, covariance_m2=frame @ np.diag(sigmas) @ frame.T
+        shift_m=prior.mean_m + frame @ away,
+        covariance_m2=told_m2 + problem.settings.hint_floor_m**2 * np.eye(2),
     )
 
 

@@ -34,6 +34,16 @@ class ClosureSettings(Settings):
     screened_per_submap: int = setting(
         48, "sub-maps", "nearest ones whose joint covariance is asked for", minimum=1
     )
+    second_looks: int = setting(
+        3,
+        "sub-maps",
+        "asked with each new one whether their open pairs are known better",
+        minimum=0,
+    )
+    second_look_share: float = setting(
+        0.5, "1", "of the sigma at the last look: then an open pair is looked at again", minimum=0.0
+    )
+    open_submaps: int = setting(256, "sub-maps", "with open pairs; the oldest go", minimum=1)
     shortest_gap_s: float = setting(
         41.0, "s", "nearer in time, sub-maps of one vehicle share their soundings", minimum=0.0
     )
@@ -98,6 +108,11 @@ class MatchJob:
     prior_covariance_m2: Array
     settings: MatchingSettings
 
+    @property
+    def prior_sigma_m(self) -> float:
+        """How well the offset was known before the match, in its worst direction."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.prior_covariance_m2)[-1]))
+
     def run(self) -> MatchOutcome:
         """Match the pair."""
         return match(
@@ -126,10 +141,44 @@ def jobs_for(
 
     Raises EstimationError if the sheet itself hangs on no node.
     """
-    calibrations = calibrations or Calibrations(matching)
+    chosen = _worth_trying(_ranked(sheet, atlas, graph, settings), settings)
+    return _jobs(sheet, chosen, graph, calibrations or Calibrations(matching))
+
+
+def jobs_again(
+    sheet: Sheet,
+    partners: list[tuple[Sheet, float]],
+    graph: PoseGraph,
+    settings: ClosureSettings,
+    calibrations: Calibrations,
+) -> list[MatchJob]:
+    """Return the matches of a sheet's open pairs whose offset is known much better by now.
+
+    partners come with the sigma at the last look. Raises EstimationError if the sheet itself hangs
+    on no node.
+    """
+    shrunk = []
+    others = [other for other, _ in partners]
+    sigmas_m = {other.id: sigma_m for other, sigma_m in partners}
+    for other, covariance_m2 in _offset_covariances(sheet, others, graph):
+        values_m2 = np.linalg.eigvalsh(covariance_m2)
+        limit_m = settings.second_look_share * sigmas_m[other.id]
+        if 0.0 < values_m2[0] and values_m2[1] <= limit_m**2:
+            shrunk.append((other, covariance_m2))
+    return _jobs(sheet, shrunk, graph, calibrations)
+
+
+def _jobs(
+    sheet: Sheet,
+    chosen: list[tuple[Sheet, Array]],
+    graph: PoseGraph,
+    calibrations: Calibrations,
+) -> list[MatchJob]:
+    if not chosen:
+        return []
     target = side_of(sheet, graph.trajectory(sheet.id.chain))
     pairs = []
-    for other, covariance_m2 in _worth_trying(_ranked(sheet, atlas, graph, settings), settings):
+    for other, covariance_m2 in chosen:
         origin = side_of(other, graph.trajectory(other.id.chain))
         shift_m = _correction(sheet, graph) - _correction(other, graph)
         calibrations.learn(origin, target, shift_m, covariance_m2)
@@ -193,7 +242,7 @@ def enter_hint(
 
     Raises EstimationError where a sub-map hangs on no node.
     """
-    if np.linalg.eigvalsh(job.prior_covariance_m2)[-1] < settings.hint_prior_m**2:
+    if job.prior_sigma_m < settings.hint_prior_m:
         return None
     walk_m2 = job.settings.walk_m2_per_s * settings.hint_span_s
     return graph.add_closure(
@@ -275,22 +324,36 @@ def _ranked(
     centres_m = np.array([other.centre_m for other in others]) + moves_m
     own_m = _correction(sheet, graph)
     distances_m = np.hypot(*(centres_m - sheet.centre_m - own_m).T)
-    anchors, nearest = [_anchor(sheet, graph)], []
-    for k in np.argsort(distances_m, kind="stable")[: settings.screened_per_submap]:
-        with contextlib.suppress(EstimationError):  # it hangs on no node: frames were lost there
-            anchors.append(_anchor(others[k], graph))
-            nearest.append(k)
-    joint_m2 = graph.covariance(anchors).reshape(len(anchors), 2, len(anchors), 2)
+    nearest = np.argsort(distances_m, kind="stable")[: settings.screened_per_submap]
+    move_m = {others[k].id: moves_m[k] for k in nearest}
     ranked = []
-    for position, k in enumerate(nearest, start=1):
-        cross_m2 = joint_m2[0, :, position]
-        covariance_m2 = joint_m2[0, :, 0] + joint_m2[position, :, position] - cross_m2 - cross_m2.T
-        shift_m = own_m - moves_m[k]
-        area_m2 = overlap_m2(others[k], sheet, shift_m + _spread(covariance_m2)).mean()
+    for other, covariance_m2 in _offset_covariances(sheet, [others[k] for k in nearest], graph):
+        shift_m = own_m - move_m[other.id]
+        area_m2 = overlap_m2(other, sheet, shift_m + _spread(covariance_m2)).mean()
         if area_m2 >= settings.expected_overlap_m2:
-            ranked.append((area_m2, others[k], covariance_m2))
+            ranked.append((area_m2, other, covariance_m2))
     ranked.sort(key=lambda item: -item[0])
     return [(other, covariance_m2) for _, other, covariance_m2 in ranked]
+
+
+def _offset_covariances(
+    sheet: Sheet, others: list[Sheet], graph: PoseGraph
+) -> list[tuple[Sheet, Array]]:
+    """Return the covariance (2, 2) in m^2 of each other sheet's offset from one.
+
+    Those that hang on no node are left out: frames were lost there.
+    """
+    anchors, placed = [_anchor(sheet, graph)], []
+    for other in others:
+        with contextlib.suppress(EstimationError):
+            anchors.append(_anchor(other, graph))
+            placed.append(other)
+    joint_m2 = graph.covariance(anchors).reshape(len(anchors), 2, len(anchors), 2)
+    found = []
+    for k, other in enumerate(placed, start=1):
+        cross_m2 = joint_m2[0, :, k]
+        found.append((other, joint_m2[0, :, 0] + joint_m2[k, :, k] - cross_m2 - cross_m2.T))
+    return found
 
 
 def _worth_trying(

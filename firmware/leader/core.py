@@ -24,6 +24,7 @@ from firmware.leader.closures import (
     corrections,
     enter_hint,
     gated,
+    jobs_again,
     jobs_for,
 )
 from firmware.leader.composition import detail_from_s
@@ -35,6 +36,7 @@ from firmware.leader.ledger import Anchor
 from firmware.leader.manoeuvre import Proposal, propose
 from firmware.leader.matching import MatchOutcome
 from firmware.leader.observability import Observability, observe
+from firmware.leader.open_pairs import OpenPairs
 from firmware.leader.outlook import situation_of
 from firmware.leader.own_grid import grid_of
 from firmware.leader.pairing import Calibrations
@@ -77,7 +79,7 @@ _SUPERFRAME_S = 60.0  # a slot that lies farther ahead was computed before the c
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SheetJobs:
-    """The matches of one new sub-map; run every job, then hand the outcomes to `finish`."""
+    """The matches of one new sub-map, and second looks; run all, hand the outcomes to `finish`."""
 
     sheet: Sheet
     jobs: tuple[MatchJob, ...]
@@ -127,6 +129,7 @@ class LeaderCore:
         )
         self._calibrations = Calibrations(settings.matching)
         self._judgement = Judgement(settings.judgement, settings.matching, self._calibrations)
+        self._open = OpenPairs(settings.closures.open_submaps)
         self._sheets_judged = 0
         self._jobs_out = False
         self.composed_s = start.time_s
@@ -212,7 +215,7 @@ class LeaderCore:
         except EstimationError:
             self.counters["submaps_unplaceable"] += 1
             jobs = []
-        return SheetJobs(sheet=sheet, jobs=tuple(jobs))
+        return SheetJobs(sheet=sheet, jobs=(*jobs, *self._second_looks()))
 
     def finish(self, done: SheetJobs, outcomes: list[MatchOutcome], now_s: float) -> None:
         """Judge what the matches of one sheet found, and bring the estimate up to it."""
@@ -221,10 +224,7 @@ class LeaderCore:
             if outcome.reason is not None:
                 self.counters[f"match_{outcome.reason.name.lower()}"] += 1
             try:
-                if outcome.hint is not None:
-                    self._judgement.note_hint(
-                        enter_hint(job, outcome.hint, self.graph, self._settings.closures)
-                    )
+                self._keep_open(job, outcome)
                 closure = closure_of(job, outcome, self.graph, now_s)
             except EstimationError:
                 self.counters["closures_unplaceable"] += 1
@@ -238,6 +238,8 @@ class LeaderCore:
             self.counters["closures_unplaceable"] += len(found)
             passed = []
         self._judgement.consider(passed, self.atlas, self.graph)
+        for closure in found:
+            self._settle_pair(closure)
         self.graph.update()
         self._jobs_out = False
         self._sheets_judged += 1
@@ -347,6 +349,35 @@ class LeaderCore:
             return None
 
     # inside
+
+    def _second_looks(self) -> Iterator[MatchJob]:
+        """Yield matches of pairs that were left open, and whose offset is known better by now."""
+        settings = self._settings.closures
+        for _ in range(min(settings.second_looks, len(self._open))):
+            turn = self._open.next_turn(self.atlas)
+            if turn is None:
+                return
+            try:
+                yield from jobs_again(*turn, self.graph, settings, self._calibrations)
+            except EstimationError:
+                self.counters["second_looks_unplaceable"] += 1
+
+    def _keep_open(self, job: MatchJob, outcome: MatchOutcome) -> None:
+        """Remember a pair that is left open; its first look's hint, if any, leans on the graph."""
+        pair = job.origin.id, job.target.id
+        is_new = self._open.hint(*pair) is None
+        self._open.note(job, outcome)
+        if outcome.hint is not None and is_new:
+            number = enter_hint(job, outcome.hint, self.graph, self._settings.closures)
+            self._judgement.note_hint(number)
+            self._open.note_hint(*pair, number)
+
+    def _settle_pair(self, closure: Closure) -> None:
+        """Let a closure take the place of the hint that its pair has left."""
+        hint = self._open.hint(closure.origin, closure.target)
+        if hint is not None and closure.active:
+            self._judgement.drop_hint(hint, self.graph)
+        self._open.settle(closure.origin, closure.target)
 
     def _outlook(self) -> dict[str, int]:
         """Return the last observation in numbers for a status line."""

@@ -108,6 +108,13 @@ class Judgement:
             self._hints.append(number)
             self.counters["hints_taken"] += 1
 
+    def drop_hint(self, number: int, graph: PoseGraph) -> None:
+        """Let a hint go for good: a closure says the same, and more surely."""
+        if number in self._hints:
+            self._hints.remove(number)
+        if number in graph:
+            graph.set_active(number, active=False)
+
     def audit(self, closures: list[Closure], graph: PoseGraph) -> None:
         """Take back active closures that the estimate contradicts; take in those it confirms."""
         for closure in closures:

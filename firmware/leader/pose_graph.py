@@ -4,14 +4,11 @@ A node is a vehicle's position and dead-reckoning bias at one of the common epoc
 is a linear factor between consecutive nodes; it carries the bias as a velocity that wanders, and
 one heading bias and log scale per vehicle. Closures and ranges speak of arbitrary times; they are
 moved to the nearest node by dead reckoning, so that no node is ever inserted between two others.
-
-The ISAM2 object is a cache of the ledger: poisoned as soon as it raises, and rebuilt.
 """
 
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import gtsam
 import numpy as np
@@ -25,33 +22,24 @@ from firmware.leader.composition import (
     kept_nodes,
     pinned_keys,
 )
-from firmware.leader.factors import factor_of
 from firmware.leader.ledger import (
     AbsoluteRecord,
     Anchor,
     ClosureRecord,
     Entry,
-    OdometryRecord,
     PriorRecord,
     RangeRecord,
     Record,
     SharedDriftRecord,
-    SharedWalkRecord,
 )
-from firmware.leader.solver import new_isam
+from firmware.leader.solver import Solver
 from firmware.leader.trajectory import Trajectory
 from firmware.leader.wander import changes_of, likely_walk
 from firmware.submaps import Track
 from protocol.errors import EstimationError
 from protocol.settings import Settings, setting
 
-_RECKONING = (PriorRecord, OdometryRecord, SharedDriftRecord, SharedWalkRecord)
-_PLAIN = ("_settings", "_chains", "_ledger", "_entered", "_walk", "_factorization", "rebuilds")
 _POSITION, _BIAS = slice(2), slice(2, 4)  # of a node's state
-_WORN = 1.3
-"""ISAM2 eliminates the newest variables last, and fills: so much of that, and it is built anew."""
-
-_SETTLING_STEPS = 2  # a robust weight follows its residual one step late
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,36 +114,14 @@ class PoseGraph:
         self._ledger: dict[int, Entry] = {}
         self._entered = 0
         self._walk = settings.bias_walk
-        self._changed: set[int] = set()
-        self._values = gtsam.Values()
-        self._fresh = gtsam.Values()
-        self._factorization = "CHOLESKY"  # until it calls a long chain indeterminate: then QR
-        self._isam = new_isam(self._factorization)
-        self._factors: dict[int, gtsam.NonlinearFactor] = {}  # of the ledger, once made
-        self._tree_entries = 0  # of ISAM2 when it was built
+        self._solver = Solver(self._ledger, settings.robust_kernel)
         self._trajectories: dict[int, Trajectory] = {}  # both until the next change
         self._newest_covariance: dict[int, Array] = {}
-        self.rebuilds = 0
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the graph as plain data, to be taken just after `compose`.
-
-        ISAM2 is built again from the point about which it was linearised, so that it is the same.
-        """
-        if self._changed or self._fresh.size():
-            raise TypeError("the graph has news that ISAM2 does not know")
-        about = self._isam.getLinearizationPoint()
-        state = {name: self.__dict__[name] for name in _PLAIN}
-        return state | {"about": {key: about.atVector(key) for key in about.keys()}}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        about = gtsam.Values()
-        for key, vector in state.pop("about").items():
-            about.insert(key, vector)
-        self.__dict__.update(state)
-        self._changed, self._fresh, self._factors = set(), gtsam.Values(), {}
-        self._trajectories, self._newest_covariance = {}, {}
-        self._rebuild(about)
+    @property
+    def rebuilds(self) -> int:
+        """How often gtsam gave up, and was built anew."""
+        return self._solver.rebuilds
 
     def add_vehicle(
         self,
@@ -178,7 +144,7 @@ class PoseGraph:
         self._chains[vehicle] = chain
         state = np.concatenate([start_m, np.zeros(2)])
         key = self._append(chain, time_s, reckoned_m, state)
-        self._fresh.insert(chain.parameters, np.zeros(2))
+        self._solver.introduce(chain.parameters, np.zeros(2))
         sigmas = np.repeat([start_sigma_m or s.start_sigma_at(time_s), s.bias_sigma_mps], 2)
         self._enter(PriorRecord(key=key, mean=state, sigmas=sigmas))
         calibration = np.array([np.radians(s.heading_bias_sigma_deg), s.log_scale_sigma])
@@ -282,7 +248,7 @@ class PoseGraph:
         entry = self._ledger[number]
         if entry.active != active:
             entry.active = active
-            self._changed.add(number)
+            self._solver.note(number)
 
     def record(self, number: int) -> Record:
         """Return a record of the ledger."""
@@ -303,35 +269,8 @@ class PoseGraph:
 
     def update(self) -> None:
         """Bring the estimate up to the ledger: incrementally, or from scratch if gtsam gives up."""
-        if not self._changed and self._fresh.size() == 0:
-            return
-        added, numbers, removed = gtsam.NonlinearFactorGraph(), [], []
-        for number in sorted(self._changed):
-            entry = self._ledger[number]
-            if entry.active and entry.slot is None:
-                added.push_back(self._factor(number))
-                numbers.append(number)
-            elif not entry.active and entry.slot is not None:
-                removed.append(entry.slot)
-                entry.slot = None
-        try:
-            result = self._isam.update(added, self._fresh, removed)
-            for number, slot in zip(numbers, result.getNewFactorsIndices(), strict=True):
-                self._ledger[number].slot = slot
-            for _ in range(_SETTLING_STEPS if numbers or removed else 0):
-                if self._isam.update().getVariablesRelinearized() == 0:
-                    break
-            self._values = self._isam.calculateEstimate()
-            if self._isam.treeNnz() > _WORN * self._tree_entries:
-                self._rebuild(self._values)
-        except RuntimeError:
-            self._factorization = "QR"
-            self._values.insert(self._fresh)
-            self._rebuild(self._values)
-            self.rebuilds += 1
-        self._fresh = gtsam.Values()
-        self._changed.clear()
-        self._forget_solution()
+        if self._solver.update():
+            self._forget_solution()
 
     def compose(self, now_s: float, settings: CompositionSettings) -> None:
         """Make the past coarse, learn how much drift wanders, and restart ISAM2 from the ledger."""
@@ -355,26 +294,25 @@ class PoseGraph:
             if time_s < detail_s
         }
         coarse = Composition(owners, apart_m2, old, estimate, settings).coarse(self._ledger)
-        self._ledger = dict(coarse.kept)
-        self._factors.clear()
+        self._ledger.clear()
+        self._ledger.update(coarse.kept)
         for record in coarse.new:
             self._enter(record)
         self._join_all()
-        values = gtsam.Values()
-        for chain in self._chains.values():
-            for key in (*chain.keys, chain.parameters):
-                values.insert(key, self._state(key))
-        self._rebuild(values)
-        self._changed.clear()
+        self._solver.restart(
+            {
+                key: self._state(key)
+                for chain in self._chains.values()
+                for key in (*chain.keys, chain.parameters)
+            }
+        )
+        self._forget_solution()
 
     def solve_batch(self) -> None:
         """Solve the ledger from scratch by Levenberg-Marquardt and restart ISAM2 from there."""
         self.update()
-        parameters = gtsam.LevenbergMarquardtParams()
-        parameters.setLinearSolverType("MULTIFRONTAL_QR")
-        graph, _ = self._active_factors()
-        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, self._values, parameters)
-        self._rebuild(optimizer.optimize())
+        self._solver.solve_batch()
+        self._forget_solution()
 
     def trajectory(self, vehicle: int) -> Trajectory:
         """Return the estimate of one vehicle at all of its nodes."""
@@ -415,7 +353,7 @@ class PoseGraph:
         chain, s = self._chains[vehicle], self._settings
         if vehicle not in self._newest_covariance:
             self.update()
-            self._newest_covariance[vehicle] = self._isam.marginalCovariance(chain.keys[-1])
+            self._newest_covariance[vehicle] = self._solver.covariance([chain.keys[-1]])
         ahead_s = max(time_s - chain.times_s[-1], 0.0)
         carry = np.hstack([np.eye(2), -ahead_s * np.eye(2)])
         grown_m2 = s.odometry_noise**2 * ahead_s + self._walk**2 * ahead_s**3 / 3
@@ -437,19 +375,8 @@ class PoseGraph:
         Raises EstimationError if the information matrix is singular.
         """
         self.update()
-        isam = self._isam
-        try:
-            if reckoned:
-                graph = gtsam.NonlinearFactorGraph()
-                for number, entry in self._ledger.items():
-                    if isinstance(entry.record, _RECKONING):
-                        graph.push_back(self._factor(number))
-                isam = new_isam(self._factorization)
-                isam.update(graph, self._values)
-            keys = [self._chains[vehicle].keys[-1] for vehicle in vehicles]
-            return np.asarray(isam.jointMarginalCovariance(keys).fullMatrix())
-        except RuntimeError as error:
-            raise EstimationError("the information matrix is singular") from error
+        keys = [self._chains[vehicle].keys[-1] for vehicle in vehicles]
+        return self._solver.covariance(keys, reckoned=reckoned)
 
     def newest_with(self, vehicles: list[int], anchors: list[Anchor]) -> Array:
         """Return the joint covariance of vehicles' newest states and of anchors' positions.
@@ -459,10 +386,7 @@ class PoseGraph:
         self.update()
         newest = [self._chains[vehicle].keys[-1] for vehicle in vehicles]
         keys = list(dict.fromkeys([*newest, *(anchor.key for anchor in anchors)]))
-        try:
-            joint = self._isam.jointMarginalCovariance(keys).fullMatrix()
-        except RuntimeError as error:
-            raise EstimationError("the information matrix is singular") from error
+        joint = self._solver.covariance(keys)
         first = dict(zip(keys, range(0, 4 * len(keys), 4), strict=True))
         rows = [first[key] + k for key in newest for k in range(4)]
         rows += [first[anchor.key] + axis for anchor in anchors for axis in (0, 1)]
@@ -487,7 +411,7 @@ class PoseGraph:
         chain.times_s.append(time_s)
         chain.reckoned_m.append(np.asarray(reckoned_m, dtype=np.float64))
         chain.keys.append(key)
-        self._fresh.insert(key, np.asarray(state, dtype=np.float64))
+        self._solver.introduce(key, state)
         self._trajectories.clear()
         self._newest_covariance.clear()
         return key
@@ -511,10 +435,7 @@ class PoseGraph:
     def _joint_covariance(self, keys: list[int], part: slice = _POSITION) -> Array:
         """Return the joint covariance (2K, 2K) of the positions in m, or biases, of K nodes."""
         self.update()
-        try:
-            joint = self._isam.jointMarginalCovariance(keys).fullMatrix()
-        except RuntimeError as error:
-            raise EstimationError("the information matrix is singular") from error
+        joint = self._solver.covariance(keys)
         rows = (4 * np.arange(len(keys))[:, None] + np.arange(4)[part]).ravel()
         return np.asarray(joint[np.ix_(rows, rows)])
 
@@ -564,38 +485,11 @@ class PoseGraph:
         number, self._entered = self._entered, self._entered + 1
         self._ledger[number] = Entry(record=record, active=active)
         if active:
-            self._changed.add(number)
+            self._solver.note(number)
         return number
 
     def _state(self, key: int) -> Array:
-        values = self._values if self._values.exists(key) else self._fresh
-        return np.asarray(values.atVector(key))
-
-    def _factor(self, number: int) -> gtsam.NonlinearFactor:
-        if number not in self._factors:
-            record = self._ledger[number].record
-            self._factors[number] = factor_of(record, self._settings.robust_kernel)
-        return self._factors[number]
-
-    def _active_factors(self) -> tuple[gtsam.NonlinearFactorGraph, list[Entry]]:
-        graph, entries = gtsam.NonlinearFactorGraph(), []
-        for number, entry in self._ledger.items():
-            if entry.active:
-                graph.push_back(self._factor(number))
-                entries.append(entry)
-        return graph, entries
-
-    def _rebuild(self, values: gtsam.Values) -> None:
-        for entry in self._ledger.values():
-            entry.slot = None
-        graph, entries = self._active_factors()
-        self._isam = new_isam(self._factorization)
-        result = self._isam.update(graph, values)
-        for entry, slot in zip(entries, result.getNewFactorsIndices(), strict=True):
-            entry.slot = slot
-        self._values = self._isam.calculateEstimate()
-        self._tree_entries = self._isam.treeNnz()
-        self._forget_solution()
+        return self._solver.state(key)
 
     def _forget_solution(self) -> None:
         self._trajectories.clear()

@@ -1,9 +1,186 @@
-"""The incremental solver of the pose graph, as it is set up here."""
+"""The incremental solver of the pose graph: ISAM2 as a cache of the ledger.
+
+It is poisoned as soon as it raises, and can be thrown away and built anew from the ledger and an
+estimate at any time. The ledger belongs to the pose graph; which slots of ISAM2 its entries have
+is the solver's.
+"""
+
+from collections.abc import Mapping
+from typing import Any
 
 import gtsam
+import numpy as np
+
+from firmware.geometry import Array
+from firmware.leader.factors import factor_of
+from firmware.leader.ledger import (
+    Entry,
+    OdometryRecord,
+    PriorRecord,
+    SharedDriftRecord,
+    SharedWalkRecord,
+)
+from protocol.errors import EstimationError
+
+_RECKONING = (PriorRecord, OdometryRecord, SharedDriftRecord, SharedWalkRecord)
+_PLAIN = ("_ledger", "_robust_kernel", "_factorization", "rebuilds")
+_WORN = 1.3
+"""ISAM2 eliminates the newest variables last, and fills: so much of that, and it is built anew."""
+
+_SETTLING_STEPS = 2  # a robust weight follows its residual one step late
 
 
-def new_isam(factorization: str) -> gtsam.ISAM2:
+class Solver:
+    """Estimates and covariances of the variables that a ledger speaks of."""
+
+    def __init__(self, ledger: dict[int, Entry], robust_kernel: float) -> None:
+        self.rebuilds = 0
+        self._ledger, self._robust_kernel = ledger, robust_kernel
+        self._changed: set[int] = set()
+        self._values = gtsam.Values()
+        self._fresh = gtsam.Values()
+        self._factorization = "CHOLESKY"  # until it calls a long chain indeterminate: then QR
+        self._isam = _new_isam(self._factorization)
+        self._factors: dict[int, gtsam.NonlinearFactor] = {}  # of the ledger, once made
+        self._tree_entries = 0  # of ISAM2 when it was built
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the solver as plain data, to be taken just after `restart`.
+
+        ISAM2 is built again from the point about which it was linearised, so that it is the same.
+        """
+        if self._changed or self._fresh.size():
+            raise TypeError("the ledger has news that ISAM2 does not know")
+        about = self._isam.getLinearizationPoint()
+        state = {name: self.__dict__[name] for name in _PLAIN}
+        return state | {"about": {key: about.atVector(key) for key in about.keys()}}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        about = _values_of(state.pop("about"))
+        self.__dict__.update(state)
+        self._changed, self._fresh, self._factors = set(), gtsam.Values(), {}
+        self._rebuild(about)
+
+    def introduce(self, key: int, guess: Array) -> None:
+        """Take in a new variable at a first guess."""
+        self._fresh.insert(key, np.asarray(guess, dtype=np.float64))
+
+    def note(self, number: int) -> None:
+        """Remember that an entry of the ledger is new, or became active or inactive."""
+        self._changed.add(number)
+
+    def state(self, key: int) -> Array:
+        """Return the estimate of a variable."""
+        values = self._values if self._values.exists(key) else self._fresh
+        return np.asarray(values.atVector(key))
+
+    def update(self) -> bool:
+        """Bring the estimate up to the ledger, and return whether there was anything to do.
+
+        Incrementally, or from scratch if gtsam gives up.
+        """
+        if not self._changed and self._fresh.size() == 0:
+            return False
+        try:
+            self._increment()
+            if self._isam.treeNnz() > _WORN * self._tree_entries:
+                self._rebuild(self._values)
+        except RuntimeError:
+            self._factorization = "QR"
+            self._values.insert(self._fresh)
+            self._rebuild(self._values)
+            self.rebuilds += 1
+        self._fresh = gtsam.Values()
+        self._changed.clear()
+        return True
+
+    def restart(self, estimate: Mapping[int, Array]) -> None:
+        """Build ISAM2 anew from a ledger that was changed at will, and an estimate of its keys."""
+        self._factors.clear()
+        self._rebuild(_values_of(estimate))
+        self._fresh = gtsam.Values()
+        self._changed.clear()
+
+    def solve_batch(self) -> None:
+        """Solve the ledger from scratch by Levenberg-Marquardt and restart ISAM2 from there."""
+        parameters = gtsam.LevenbergMarquardtParams()
+        parameters.setLinearSolverType("MULTIFRONTAL_QR")
+        graph, _ = self._active_factors()
+        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, self._values, parameters)
+        self._rebuild(optimizer.optimize())
+
+    def covariance(self, keys: list[int], *, reckoned: bool = False) -> Array:
+        """Return the joint covariance of variables, in their order.
+
+        `reckoned` leaves out closures, ranges and fixes: what dead reckoning alone would know.
+        Raises EstimationError if the information matrix is singular.
+        """
+        try:
+            isam = self._reckoning() if reckoned else self._isam
+            return np.asarray(isam.jointMarginalCovariance(keys).fullMatrix())
+        except RuntimeError as error:
+            raise EstimationError("the information matrix is singular") from error
+
+    def _increment(self) -> None:
+        added, numbers, removed = gtsam.NonlinearFactorGraph(), [], []
+        for number in sorted(self._changed):
+            entry = self._ledger[number]
+            if entry.active and entry.slot is None:
+                added.push_back(self._factor(number))
+                numbers.append(number)
+            elif not entry.active and entry.slot is not None:
+                removed.append(entry.slot)
+                entry.slot = None
+        result = self._isam.update(added, self._fresh, removed)
+        for number, slot in zip(numbers, result.getNewFactorsIndices(), strict=True):
+            self._ledger[number].slot = slot
+        for _ in range(_SETTLING_STEPS if numbers or removed else 0):
+            if self._isam.update().getVariablesRelinearized() == 0:
+                break
+        self._values = self._isam.calculateEstimate()
+
+    def _rebuild(self, values: gtsam.Values) -> None:
+        for entry in self._ledger.values():
+            entry.slot = None
+        graph, entries = self._active_factors()
+        self._isam = _new_isam(self._factorization)
+        result = self._isam.update(graph, values)
+        for entry, slot in zip(entries, result.getNewFactorsIndices(), strict=True):
+            entry.slot = slot
+        self._values = self._isam.calculateEstimate()
+        self._tree_entries = self._isam.treeNnz()
+
+    def _reckoning(self) -> gtsam.ISAM2:
+        graph = gtsam.NonlinearFactorGraph()
+        for number, entry in self._ledger.items():
+            if isinstance(entry.record, _RECKONING):
+                graph.push_back(self._factor(number))
+        isam = _new_isam(self._factorization)
+        isam.update(graph, self._values)
+        return isam
+
+    def _factor(self, number: int) -> gtsam.NonlinearFactor:
+        if number not in self._factors:
+            self._factors[number] = factor_of(self._ledger[number].record, self._robust_kernel)
+        return self._factors[number]
+
+    def _active_factors(self) -> tuple[gtsam.NonlinearFactorGraph, list[Entry]]:
+        graph, entries = gtsam.NonlinearFactorGraph(), []
+        for number, entry in self._ledger.items():
+            if entry.active:
+                graph.push_back(self._factor(number))
+                entries.append(entry)
+        return graph, entries
+
+
+def _values_of(estimate: Mapping[int, Array]) -> gtsam.Values:
+    values = gtsam.Values()
+    for key, vector in estimate.items():
+        values.insert(key, vector)
+    return values
+
+
+def _new_isam(factorization: str) -> gtsam.ISAM2:
     """Return an empty ISAM2 that factorises by `QR` or `CHOLESKY`."""
     parameters = gtsam.ISAM2Params()
     parameters.setFactorization(factorization)

@@ -81,8 +81,8 @@ def test_covariance_is_that_of_the_dense_information_matrix() -> None:
     close(graph, track, true_m, 10, 90)
     graph.update()
     anchors = [graph.anchor(0, t, track) for t in (0.0, 50.0, 100.0)]
-    linear = graph._isam.getFactorsUnsafe().linearize(graph._values)
-    ordering = sorted(graph._values.keys())
+    linear = graph._solver._isam.getFactorsUnsafe().linearize(graph._solver._values)
+    ordering = sorted(graph._solver._values.keys())
     jacobian, _ = linear.jacobian()
     dense_m2 = np.linalg.inv(jacobian.T @ jacobian)
     first = {key: 2 + 4 * k for k, key in enumerate(k for k in ordering if chr(k >> 56) == "x")}

@@ -6,9 +6,11 @@ most of Eq. 5 and 6 would be spent on what the neighbours tell as well.
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from firmware.compression.decoder import PointDecoder
 from firmware.compression.fit import spacing_of
+from firmware.compression.kernels import Kernel
 from firmware.compression.lattice_frame import cubic_weights
 from firmware.geometry import Array
 
@@ -24,15 +26,14 @@ def gridded(
     if not inside.any():
         return depth_m, variance_m2
     cell_m = float(north_m[1] - north_m[0]) if north_m.size > 1 else np.inf
-    spacing_m = spacing_of(decoder.points_m.astype(np.float64))
-    stride = min(int(spacing_m / (_NODES_A_SPACING * cell_m)), _LONGEST_STRIDE)
+    stride = min(int(_smooth_m(decoder) / (_NODES_A_SPACING * cell_m)), _LONGEST_STRIDE)
     if stride < 2:
         row, column = np.nonzero(inside)
         places_m = np.column_stack([north_m[row], east_m[column]])
         depth_m[inside], variance_m2[inside] = decoder.predict(places_m)
         return depth_m, variance_m2
     along, across = (_between(axis.size, stride) for axis in (north_m, east_m))
-    used = (along != 0.0).T @ inside.astype(np.float64) @ (across != 0.0) > 0.0
+    used = abs(along).T @ inside.astype(np.float64) @ abs(across) > 0.0
     row, column = np.nonzero(used)
     nodes_m = np.column_stack(
         [
@@ -48,10 +49,18 @@ def gridded(
     return depth_m, variance_m2
 
 
-def _between(cells: int, stride: int) -> Array:
+def _smooth_m(decoder: PointDecoder) -> float:
+    """Return over what distance a decoder's map is smooth: its points' spacing, or its kernel's."""
+    if decoder.hyper.kernel is Kernel.EXPONENTIAL:
+        return 0.0
+    length_m = 1.0 / max(abs(decoder.hyper.b_per_m), 1e-9)
+    return min(spacing_of(decoder.points_m.astype(np.float64)), length_m)
+
+
+def _between(cells: int, stride: int) -> csr_array:
     """Return the weights (cells, nodes) of nodes every stride, from one before the first cell."""
     whole, part = np.divmod(np.arange(cells), stride)
-    weights = np.zeros((cells, int(whole[-1]) + 4))
     columns = whole[:, None] + np.arange(4)
-    np.put_along_axis(weights, columns, cubic_weights(part / stride), axis=1)
-    return weights
+    weights = cubic_weights(part / stride).ravel()
+    starts = 4 * np.arange(cells + 1)
+    return csr_array((weights, columns.ravel(), starts), shape=(cells, int(whole[-1]) + 4))

@@ -1,5 +1,7 @@
 """A fine grid costs no more than the points can tell apart, and says the same."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -50,6 +52,35 @@ def test_a_fine_grid_asks_the_points_far_less_often_than_it_has_cells(
     axis_m: Array = np.arange(-30.0, 30.0, 0.5)
     gridded(decoder, axis_m, axis_m, np.ones((120, 120), dtype=bool))
     assert 0 < asked < 120 * 120 / 5
+
+
+@pytest.mark.parametrize(
+    "kernel", [Kernel.SQUARED_EXPONENTIAL, Kernel.MATERN32, Kernel.EXPONENTIAL]
+)
+@pytest.mark.parametrize("spacings", [0.2, 0.5, 1.0, 2.0])
+def test_kernels_shorter_than_the_spacing_are_asked_as_often_as_they_vary(
+    decoder: PointDecoder, kernel: Kernel, spacings: float
+) -> None:
+    hyper = Hyperparameters(
+        b_per_m=1.0 / (5.5 * spacings), c_m2=0.25, sigma2_m2=0.02, mean_depth_m=40.0, kernel=kernel
+    )
+    rough = point_decoder(np.column_stack([decoder.points_m, relief_m(*decoder.points_m.T)]), hyper)
+    axis_m: Array = np.arange(-30.0, 30.0, 1.0)
+    inside = np.ones((60, 60), dtype=bool)
+    depth_m, variance_m2 = gridded(rough, axis_m, axis_m, inside)
+    row, column = np.nonzero(inside)
+    asked = rough.predict(np.column_stack([axis_m[row], axis_m[column]]))
+    assert np.abs(depth_m[inside] - asked[0]).max() < 0.06
+    np.testing.assert_allclose(np.sqrt(variance_m2[inside]), np.sqrt(asked[1]), rtol=0.4)
+
+
+def test_a_point_far_away_costs_no_memory_for_the_way_there(decoder: PointDecoder) -> None:
+    north_m: Array = np.arange(0.0, 60_000.0, 1.0)
+    tracemalloc.start()
+    gridded(decoder, north_m, np.array([0.0]), np.ones((60_000, 1), dtype=bool))
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 400e6  # a dense matrix of 60,000 cells and 20,000 nodes has 9.6 GB
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1)])

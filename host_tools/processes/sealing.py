@@ -22,12 +22,17 @@ def seal_of(vehicle: int, key: Path, store: Path | None, *, encrypts: bool = Fal
     ------
     ConfigError
         For a key file that cannot be used, without a store: counters must outlive a crash; and
-        for encryption where its library is not installed.
+        for encryption where its library is not installed, or the clock stands before 2025.
     """
     keys = load_keys(key)
     if store is None:
         raise ConfigError("--key needs --store DIR: seal counters must survive a restart")
     floor = max(0, int(time.clock_gettime(time.CLOCK_REALTIME)) - COUNTER_ZERO_UTC_S)
+    if encrypts and floor == 0:
+        raise ConfigError(
+            "--encrypt needs the right time of day, and this clock stands before 2025: set it, "
+            "or counters of a store that was lost would repeat"
+        )
     counter = ReservedCounter(store / f"seal_{vehicle}.counter", floor=floor)
     marks = FileMarks(store / f"seal_{vehicle}.marks")
     suite = _aes() if encrypts else Blake2sSuite()

@@ -20,6 +20,7 @@ from protocol.settings import Settings, setting
 
 _WILD_DENSITY = 1e-4  # per metre: multipath from anywhere in the water column
 _GRID_STEP_SIGMAS = 0.5
+_SPREAD_OVER_S = 20.0
 _SHARES = np.array([0.05, 0.2, 0.4, 0.6, 0.8, 0.95])
 _LONGEST_GRID = 1000  # half-widths: a kilometre of miss at the usual sigma
 
@@ -40,7 +41,7 @@ class RangeSettings(Settings):
         0.2, "1", "share of outliers before any were seen", minimum=0.01, maximum=0.99
     )
     window_spread_m: float = setting(
-        1.3, "m", "relative dead reckoning over one window", minimum=0.0
+        1.3, "m", "relative dead reckoning over 20 s; it grows with the root", minimum=0.0
     )
     rate_sigma_mps: float = setting(
         0.15, "m/s", "relative drift along the line of sight that is not known yet", minimum=1e-3
@@ -102,7 +103,8 @@ class RangeJudge:
         is lost, and by a rate, because the vehicles' drift may not be known yet.
         """
         s = self._settings
-        sigma_m = float(np.hypot(s.sigma_m, s.window_spread_m))
+        span_s = max(float(np.ptp(time_s)), _SPREAD_OVER_S)
+        sigma_m = float(np.hypot(s.sigma_m, s.window_spread_m * np.sqrt(span_s / _SPREAD_OVER_S)))
         sane = np.isfinite(measured_m) & (measured_m >= s.shortest_m) & (measured_m <= s.longest_m)
         if not np.any(sane):
             return RangeVerdict(true=sane & False, stretched=sane & False, certain=False)
@@ -116,9 +118,10 @@ class RangeJudge:
             predicted_m[:, None, None] + miss_m[:, None] + age_s[:, None, None] * rate_mps,
             sigma_m,
         )
-        usual = np.exp(-0.5 * (miss_m / prior_sigma_m) ** 2) / prior_sigma_m
-        lost = np.exp(-0.5 * (miss_m / lost_m) ** 2) / lost_m
-        log_prior = np.log((1.0 - s.lost_share) * usual + s.lost_share * lost)
+        usual, lost = (np.exp(-0.5 * (miss_m / sigma) ** 2) for sigma in (prior_sigma_m, lost_m))
+        log_prior = np.log(
+            (1.0 - s.lost_share) * usual / usual.sum() + s.lost_share * lost / lost.sum()
+        )
         score = log_prior[:, None] - 0.5 * (rate_mps / s.rate_sigma_mps) ** 2
         score += self._log_likelihood(as_true[sane], as_stretched[sane])
         belief = np.exp(score - score.max())

@@ -1,5 +1,6 @@
 """One-way ranges: held until the sender's state at transmission is known, judged, then used."""
 
+import enum
 from collections import Counter, deque
 from dataclasses import dataclass
 
@@ -35,6 +36,14 @@ class _PlacedRange:
     direction: np.ndarray  # (2,) unit vector from here to there
 
 
+class _Fate(enum.Enum):
+    """What became of a window that was judged."""
+
+    ENTERED = enum.auto()
+    BENT = enum.auto()
+    UNDECIDED = enum.auto()
+
+
 class Ranging:
     """Ranges in by `hold`, factors out by `use`; bounded, everything dropped is counted."""
 
@@ -56,22 +65,19 @@ class Ranging:
         if len(self._held) == self._held.maxlen:
             self.counters["ranges_overwritten"] += 1
         sent_s = transmission_s(header.tx_second, toa_s)
-        self._held.append(
-            _HeldRange(
-                chain=chain,
-                sent_s=sent_s,
-                arrived_s=toa_s,
-                range_m=(toa_s - sent_s) * self._settings.sound_speed_mps,
-            )
-        )
+        range_m = (toa_s - sent_s) * self._settings.sound_speed_mps
+        if not self._settings.shortest_m <= range_m <= self._settings.longest_m:
+            self.counters["ranges_impossible"] += 1
+            return
+        self._held.append(_HeldRange(chain=chain, sent_s=sent_s, arrived_s=toa_s, range_m=range_m))
 
     def use(
         self, chain: int, track: Track, receiver: int, receiver_track: Track, graph: PoseGraph
     ) -> None:
-        """Judge, as one window, the held ranges whose both ends are known; enter the good ones.
+        """Judge, by windows, the held ranges whose both ends are known; enter the good ones.
 
-        While the vehicles may lie so far across the line of sight that a range bends, the window
-        waits; while two explanations of it compete, the next one joins it. Once a window is
+        While the vehicles may lie so far across the line of sight that a range bends, or while two
+        explanations of a window compete, it waits, and the next one joins it. Once a window is
         understood, those that wait are tried again, newest first.
         """
         end_s = float(track.time_s[-1])
@@ -81,22 +87,29 @@ class Ranging:
         self._held = deque((r for r in self._held if r not in ready), self._held.maxlen)
         graph.update()
         waiting = self._waiting.setdefault(chain, deque())
-        self._join(waiting, ready)
+        for held in ready:
+            self._join(waiting, held)
+        undecided: deque[list[_HeldRange]] = deque()
         while waiting:
-            placed = self._placed(waiting[-1], (receiver, receiver_track), (chain, track), graph)
-            if placed and not self._enter(placed, graph):
-                return
-            waiting.pop()
-            graph.update()
+            window = waiting.pop()
+            placed = self._placed(window, (receiver, receiver_track), (chain, track), graph)
+            fate = self._enter(placed, graph) if placed else _Fate.ENTERED
+            if fate is _Fate.ENTERED:
+                graph.update()
+                continue
+            undecided.appendleft(window)
+            if fate is _Fate.BENT:
+                break
+        waiting.extend(undecided)
 
-    def _join(self, waiting: deque[list[_HeldRange]], ready: list[_HeldRange]) -> None:
-        """Let a window wait, with the newest one if that is recent and there is room; bounded."""
+    def _join(self, waiting: deque[list[_HeldRange]], held: _HeldRange) -> None:
+        """Let a range wait with the newest window, or begin a new one; bounded."""
         s = self._settings
-        near = waiting and ready[0].sent_s - waiting[-1][0].sent_s <= s.joined_s
-        if near and len(waiting[-1]) + len(ready) <= s.joined:
-            waiting[-1].extend(ready)
-        else:
-            waiting.append(ready)
+        newest = waiting[-1] if waiting else []
+        if newest and held.sent_s - newest[0].sent_s <= s.joined_s and len(newest) < s.joined:
+            newest.append(held)
+            return
+        waiting.append([held])
         if len(waiting) > s.waiting:
             self.counters["ranges_given_up"] += len(waiting.popleft())
 
@@ -117,11 +130,11 @@ class Ranging:
                 self.counters["ranges_unplaceable"] += 1
         return placed
 
-    def _enter(self, placed: list[_PlacedRange], graph: PoseGraph) -> bool:
-        """Enter what can be believed of a window; return False if it has to wait."""
+    def _enter(self, placed: list[_PlacedRange], graph: PoseGraph) -> _Fate:
+        """Enter what can be believed of a window, unless it has to wait."""
         along_m, bent_m = _spread(placed[len(placed) // 2], graph)
         if bent_m > self._settings.bent_m:
-            return False
+            return _Fate.BENT
         verdict = self._judge.judge(
             np.array([p.range_m for p in placed]),
             np.array([p.predicted_m for p in placed]),
@@ -129,7 +142,7 @@ class Ranging:
             float(np.hypot(along_m, bent_m)),
         )
         if not verdict.certain:
-            return False
+            return _Fate.UNDECIDED
         for k, p in enumerate(placed):
             if verdict.true[k]:
                 graph.add_range(p.here, p.there, p.range_m, bent_m)
@@ -140,7 +153,7 @@ class Ranging:
                 self.counters["ranges_unstretched"] += 1
             else:
                 self.counters["ranges_rejected"] += 1
-        return True
+        return _Fate.ENTERED
 
 
 def _spread(placed: _PlacedRange, graph: PoseGraph) -> tuple[float, float]:

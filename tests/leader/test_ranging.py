@@ -1,7 +1,12 @@
 from dataclasses import replace
+from unittest.mock import MagicMock
+
+import numpy as np
+import pytest
 
 from firmware.leader.ranges import RangeSettings
-from firmware.leader.ranging import Ranging
+from firmware.leader.ranging import Ranging, _Fate
+from firmware.submaps import Track
 from tests.protocol.strategies import paper_packet
 
 
@@ -14,3 +19,70 @@ def test_frames_of_one_packet_give_one_range() -> None:
     ranging.hold(1, header, 24.4)
     assert [held.chain for held in ranging._held] == [1, 2, 1]
     assert ranging.counters == {"ranges_of_one_packet": 1}
+
+
+def _track(end_s: float) -> Track:
+    times_s = np.arange(end_s + 1.0)
+    return Track(time_s=times_s, north_m=times_s, east_m=0 * times_s, yaw_rad=0 * times_s)
+
+
+def _heard(ranging: Ranging, begin_s: int, end_s: int) -> None:
+    header = paper_packet().header
+    for sent_s in range(begin_s, end_s, 8):
+        ranging.hold(1, replace(header, tx_second=sent_s % 16), sent_s + 0.4)
+
+
+def test_window_that_stays_undecided_does_not_hold_up_older_ones(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Bent windows wait, the next stays undecided for ever; the third frees the bent ones."""
+    fates = {8: _Fate.BENT, 104: _Fate.UNDECIDED, 200: _Fate.ENTERED}
+    tried: list[int] = []
+
+    def placed(_self: Ranging, window: list[object], *_: object) -> list[object]:
+        return window
+
+    def enter(_self: Ranging, window: list[MagicMock], _graph: object) -> _Fate:
+        begin_s = max(s for s in fates if s <= window[0].sent_s)
+        tried.append(begin_s)
+        return fates[begin_s]
+
+    monkeypatch.setattr(Ranging, "_placed", placed)
+    monkeypatch.setattr(Ranging, "_enter", enter)
+    ranging, graph = Ranging(RangeSettings()), MagicMock()
+    for begin_s, end_s in ((8, 60), (104, 160)):
+        _heard(ranging, begin_s, end_s)
+        ranging.use(1, _track(end_s), 0, _track(end_s), graph)
+    fates[8] = _Fate.ENTERED
+    tried.clear()
+    _heard(ranging, 200, 250)
+    ranging.use(1, _track(250), 0, _track(250), graph)
+    assert tried == [200, 104, 8]
+    assert [window[0].sent_s for window in ranging._waiting[1]] == [104]
+
+
+def test_no_window_grows_without_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes: list[int] = []
+
+    def enter(_self: Ranging, window: list[object], _graph: object) -> _Fate:
+        sizes.append(len(window))
+        return _Fate.UNDECIDED
+
+    monkeypatch.setattr(Ranging, "_placed", lambda _self, window, *_: window)
+    monkeypatch.setattr(Ranging, "_enter", enter)
+    settings = RangeSettings(waiting=3)
+    ranging = Ranging(settings)
+    for begin_s in range(0, 1600, 200):
+        _heard(ranging, begin_s, begin_s + 200)
+        ranging.use(1, _track(begin_s + 200), 0, _track(begin_s + 200), MagicMock())
+    assert max(sizes) <= settings.joined
+    assert len(ranging._waiting[1]) == 3
+    assert ranging.counters["ranges_given_up"] > 0
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.001, 60.0])
+def test_impossible_ranges_are_counted_and_not_held(late_s: float) -> None:
+    ranging = Ranging(RangeSettings())
+    ranging.hold(1, replace(paper_packet().header, tx_second=8), 8.0 + late_s)
+    assert not ranging._held
+    assert ranging.counters["ranges_impossible"] == 1

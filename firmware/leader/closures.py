@@ -43,7 +43,9 @@ class ClosureSettings(Settings):
     second_look_share: float = setting(
         0.5, "1", "of the sigma at the last look: then an open pair is looked at again", minimum=0.0
     )
-    open_submaps: int = setting(256, "sub-maps", "with open pairs; the oldest go", minimum=1)
+    open_submaps: int = setting(
+        256, "sub-maps", "with open pairs; the longest not looked at go", minimum=1
+    )
     shortest_gap_s: float = setting(
         41.0, "s", "nearer in time, sub-maps of one vehicle share their soundings", minimum=0.0
     )
@@ -141,47 +143,69 @@ def jobs_for(
 
     Raises EstimationError if the sheet itself hangs on no node.
     """
-    chosen = _worth_trying(_ranked(sheet, atlas, graph, settings), settings)
-    return _jobs(sheet, chosen, graph, calibrations or Calibrations(matching))
+    own_m = _correction(sheet, graph)
+    chosen = [
+        (other, covariance_m2, own_m - _correction(other, graph))
+        for other, covariance_m2 in _worth_trying(_ranked(sheet, atlas, graph, settings), settings)
+    ]
+    return _jobs(sheet, chosen, graph, calibrations or Calibrations(matching), learn=True)
 
 
 def jobs_again(
     sheet: Sheet,
-    partners: list[tuple[Sheet, float]],
+    partners: list[tuple[Sheet, float, int | None]],
     graph: PoseGraph,
     settings: ClosureSettings,
     calibrations: Calibrations,
 ) -> list[MatchJob]:
-    """Return the matches of a sheet's open pairs whose offset is known much better by now.
+    """Return the matches of a sheet's open pairs whose offset others have told much better by now.
 
-    partners come with the sigma at the last look. Raises EstimationError if the sheet itself hangs
-    on no node.
+    partners come with the sigma at the last look and the number of the hint that a look has left,
+    if any: what the pair itself told is taken out of what is known, lest it confirm itself. Raises
+    EstimationError if the sheet itself hangs on no node.
     """
-    shrunk = []
-    others = [other for other, _ in partners]
-    sigmas_m = {other.id: sigma_m for other, sigma_m in partners}
-    for other, covariance_m2 in _offset_covariances(sheet, others, graph):
+    open_pairs = {other.id: (sigma_m, hint) for other, sigma_m, hint in partners}
+    shrunk, own_m = [], _correction(sheet, graph)
+    for other, known_m2 in _offset_covariances(sheet, [p[0] for p in partners], graph):
+        sigma_m, hint = open_pairs[other.id]
+        shift_m, covariance_m2 = own_m - _correction(other, graph), known_m2
+        if hint is not None:
+            reckoned_m = sheet.reckoned_at(sheet.time_s) - other.reckoned_at(other.time_s)
+            told = graph.closure(hint)
+            told_m = told.offset_m - reckoned_m
+            shift_m, covariance_m2 = _without(shift_m, known_m2, told_m, told.covariance_m2)
         values_m2 = np.linalg.eigvalsh(covariance_m2)
-        limit_m = settings.second_look_share * sigmas_m[other.id]
-        if 0.0 < values_m2[0] and values_m2[1] <= limit_m**2:
-            shrunk.append((other, covariance_m2))
-    return _jobs(sheet, shrunk, graph, calibrations)
+        if 0.0 < values_m2[0] and values_m2[1] <= (settings.second_look_share * sigma_m) ** 2:
+            shrunk.append((other, covariance_m2, shift_m))
+    return _jobs(sheet, shrunk[: settings.pairs_per_submap], graph, calibrations, learn=False)
+
+
+def _without(
+    mean_m: Array, covariance_m2: Array, told_m: Array, told_m2: Array
+) -> tuple[Array, Array]:
+    """Return mean and covariance of a Gaussian from which one of its factors is taken out."""
+    told, known = np.linalg.inv(told_m2), np.linalg.inv(covariance_m2)
+    left_m2 = np.linalg.inv(known - told)
+    return left_m2 @ (known @ mean_m - told @ told_m), left_m2
 
 
 def _jobs(
     sheet: Sheet,
-    chosen: list[tuple[Sheet, Array]],
+    chosen: list[tuple[Sheet, Array, Array]],
     graph: PoseGraph,
     calibrations: Calibrations,
+    *,
+    learn: bool,
 ) -> list[MatchJob]:
+    """Return the matches with other sheets, given with covariance and shift of their offset."""
     if not chosen:
         return []
     target = side_of(sheet, graph.trajectory(sheet.id.chain))
     pairs = []
-    for other, covariance_m2 in chosen:
+    for other, covariance_m2, shift_m in chosen:
         origin = side_of(other, graph.trajectory(other.id.chain))
-        shift_m = _correction(sheet, graph) - _correction(other, graph)
-        calibrations.learn(origin, target, shift_m, covariance_m2)
+        if learn:
+            calibrations.learn(origin, target, shift_m, covariance_m2)
         pairs.append((origin, shift_m, covariance_m2))
     grid = calibrations.level(target)
     return [

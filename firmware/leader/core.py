@@ -215,7 +215,7 @@ class LeaderCore:
         except EstimationError:
             self.counters["submaps_unplaceable"] += 1
             jobs = []
-        return SheetJobs(sheet=sheet, jobs=(*jobs, *self._second_looks()))
+        return SheetJobs(sheet=sheet, jobs=(*jobs, *self._second_looks(sheet)))
 
     def finish(self, done: SheetJobs, outcomes: list[MatchOutcome], now_s: float) -> None:
         """Judge what the matches of one sheet found, and bring the estimate up to it."""
@@ -224,7 +224,7 @@ class LeaderCore:
             if outcome.reason is not None:
                 self.counters[f"match_{outcome.reason.name.lower()}"] += 1
             try:
-                self._keep_open(job, outcome)
+                self._keep_or_settle(job, outcome)
                 closure = closure_of(job, outcome, self.graph, now_s)
             except EstimationError:
                 self.counters["closures_unplaceable"] += 1
@@ -238,8 +238,6 @@ class LeaderCore:
             self.counters["closures_unplaceable"] += len(found)
             passed = []
         self._judgement.consider(passed, self.atlas, self.graph)
-        for closure in found:
-            self._settle_pair(closure)
         self.graph.update()
         self._jobs_out = False
         self._sheets_judged += 1
@@ -321,6 +319,8 @@ class LeaderCore:
             "bad_beams": self._builder.bad_beams,
             "bad_pings": self._builder.bad_pings,
             "graph_rebuilds": self.graph.rebuilds,
+            "open_submaps": len(self._open),
+            "open_submaps_dropped": self._open.dropped,
             **self._outlook(),
         }
 
@@ -350,34 +350,42 @@ class LeaderCore:
 
     # inside
 
-    def _second_looks(self) -> Iterator[MatchJob]:
-        """Yield matches of pairs that were left open, and whose offset is known better by now."""
-        settings = self._settings.closures
-        for _ in range(min(settings.second_looks, len(self._open))):
-            turn = self._open.next_turn(self.atlas)
-            if turn is None:
+    def _second_looks(self, sheet: Sheet) -> Iterator[MatchJob]:
+        """Yield matches of pairs that were left open, and whose offset is known better by now.
+
+        Each sheet has one turn at most beside a new one, and no more pairs than that are tried.
+        """
+        settings, seen, looks = self._settings.closures, {sheet.id}, 0
+        for _ in range(settings.second_looks):
+            turn = self._open.next_turn(self.atlas, self.graph)
+            if turn is None or turn[0].id in seen or looks >= settings.pairs_per_submap:
                 return
+            seen.add(turn[0].id)
             try:
-                yield from jobs_again(*turn, self.graph, settings, self._calibrations)
+                jobs = jobs_again(*turn, self.graph, settings, self._calibrations)
             except EstimationError:
                 self.counters["second_looks_unplaceable"] += 1
+                continue
+            looks += len(jobs)
+            self.counters["second_looks"] += len(jobs)
+            yield from jobs
 
-    def _keep_open(self, job: MatchJob, outcome: MatchOutcome) -> None:
-        """Remember a pair that is left open; its first look's hint, if any, leans on the graph."""
+    def _keep_or_settle(self, job: MatchJob, outcome: MatchOutcome) -> None:
+        """Keep a pair open with the hint of its first look; a match takes the hint's place.
+
+        The hint goes before the match is gated, lest what the pair has told count twice.
+        """
         pair = job.origin.id, job.target.id
-        is_new = self._open.hint(*pair) is None
+        hint = self._open.hint(*pair)
         self._open.note(job, outcome)
-        if outcome.hint is not None and is_new:
+        if outcome.match is not None:
+            self._open.settle(*pair)
+            if hint is not None:
+                self._judgement.drop_hint(hint, self.graph)
+        elif outcome.hint is not None and hint is None:
             number = enter_hint(job, outcome.hint, self.graph, self._settings.closures)
             self._judgement.note_hint(number)
             self._open.note_hint(*pair, number)
-
-    def _settle_pair(self, closure: Closure) -> None:
-        """Let a closure take the place of the hint that its pair has left."""
-        hint = self._open.hint(closure.origin, closure.target)
-        if hint is not None and closure.active:
-            self._judgement.drop_hint(hint, self.graph)
-        self._open.settle(closure.origin, closure.target)
 
     def _outlook(self) -> dict[str, int]:
         """Return the last observation in numbers for a status line."""

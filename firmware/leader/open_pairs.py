@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from firmware.leader.atlas import Atlas, Sheet, SheetId
 from firmware.leader.closures import MatchJob
 from firmware.leader.matching import MatchOutcome, NoMatch
+from firmware.leader.pose_graph import PoseGraph
 
 _OPEN = (NoMatch.AMBIGUOUS, NoMatch.LOOSE)  # what a narrower prior may decide
 
@@ -26,6 +27,7 @@ class OpenPairs:
     """Open pairs by the sheet that was matched, bounded by the number of such sheets."""
 
     def __init__(self, capacity: int) -> None:
+        self.dropped = 0
         self._capacity = capacity
         self._of: OrderedDict[SheetId, dict[SheetId, OpenPair]] = OrderedDict()
 
@@ -40,6 +42,7 @@ class OpenPairs:
             self.settle(job.origin.id, job.target.id)
         while len(self._of) > self._capacity:
             self._of.popitem(last=False)
+            self.dropped += 1
 
     def hint(self, origin: SheetId, target: SheetId) -> int | None:
         """Return the hint that a look at the pair has left, if any."""
@@ -59,14 +62,21 @@ class OpenPairs:
         if not pairs:
             self._of.pop(target, None)
 
-    def next_turn(self, atlas: Atlas) -> tuple[Sheet, list[tuple[Sheet, float]]] | None:
-        """Return the sheet whose turn it is, and its open partners with their sigmas in metres.
+    def next_turn(
+        self, atlas: Atlas, graph: PoseGraph
+    ) -> tuple[Sheet, list[tuple[Sheet, float, int | None]]] | None:
+        """Return the sheet whose turn it is, and its open partners with sigma in metres and hint.
 
-        Sheets take turns; one that is matched no more is forgotten. None if none is left.
+        Sheets take turns; one that is matched no more is forgotten. A partner whose hint was
+        composed with others is passed over: nobody knows any more what the pair itself has told.
         """
         while self._of:
             target, pairs = self._of.popitem(last=False)
-            partners = [(atlas[o], pair.sigma_m) for o, pair in pairs.items() if o in atlas]
+            partners = [
+                (atlas[origin], pair.sigma_m, pair.hint if graph.is_active(pair.hint) else None)
+                for origin, pair in pairs.items()
+                if origin in atlas and (pair.hint is None or pair.hint in graph)
+            ]
             if target in atlas and partners:
                 self._of[target] = pairs
                 return atlas[target], partners

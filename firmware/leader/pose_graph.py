@@ -34,7 +34,7 @@ from firmware.leader.ledger import (
 )
 from firmware.leader.solver import Solver
 from firmware.leader.trajectory import Trajectory
-from firmware.leader.wander import changes_of, likely_walk
+from firmware.leader.wander import changes_of, expected_walk, likely_walk
 from firmware.submaps import Track
 from protocol.errors import EstimationError
 from protocol.settings import Settings, setting
@@ -254,6 +254,20 @@ class PoseGraph:
         """Return a record of the ledger."""
         return self._ledger[number].record
 
+    def closure(self, number: int) -> ClosureRecord:
+        """Return a closure or hint of the ledger.
+
+        Raises EstimationError if the record is none.
+        """
+        record = self._ledger[number].record
+        if not isinstance(record, ClosureRecord):
+            raise EstimationError(f"record {number} is not a closure")
+        return record
+
+    def is_active(self, number: int | None) -> bool:
+        """Return whether the estimate uses a record; False if there is none of that number."""
+        return number in self._ledger and self._ledger[number].active
+
     def __contains__(self, number: object) -> bool:
         return number in self._ledger
 
@@ -362,7 +376,7 @@ class PoseGraph:
 
     def innovation(self, number: int) -> Array:
         """Return estimated minus measured offset (2,) of a closure, in metres."""
-        record = self._closure(number)
+        record = self.closure(number)
         ends = (record.origin, record.target)
         origin_m, target_m = (self._state(end.key)[:2] for end in ends)
         parameters = [self._state(end.parameters) for end in ends]
@@ -396,14 +410,8 @@ class PoseGraph:
         """Return the squared innovation of a closure in units of its covariance."""
         innovation_m = self.innovation(number)
         return float(
-            innovation_m @ np.linalg.solve(self._closure(number).covariance_m2, innovation_m)
+            innovation_m @ np.linalg.solve(self.closure(number).covariance_m2, innovation_m)
         )
-
-    def _closure(self, number: int) -> ClosureRecord:
-        record = self._ledger[number].record
-        if not isinstance(record, ClosureRecord):
-            raise EstimationError(f"record {number} is not a closure")
-        return record
 
     def _append(self, chain: Chain, time_s: float, reckoned_m: Array, state: Array) -> int:
         key: int = gtsam.symbol("x", (chain.number << 24) | chain.added)
@@ -432,10 +440,12 @@ class PoseGraph:
         for tie in shared_walk(first, chain, begin_s, end_s, apart):
             self._enter(tie)
 
-    def _joint_covariance(self, keys: list[int], part: slice = _POSITION) -> Array:
+    def _joint_covariance(
+        self, keys: list[int], part: slice = _POSITION, *, reckoned: bool = False
+    ) -> Array:
         """Return the joint covariance (2K, 2K) of the positions in m, or biases, of K nodes."""
         self.update()
-        joint = self._solver.covariance(keys)
+        joint = self._solver.covariance(keys, reckoned=reckoned)
         rows = (4 * np.arange(len(keys))[:, None] + np.arange(4)[part]).ravel()
         return np.asarray(joint[np.ix_(rows, rows)])
 
@@ -451,9 +461,10 @@ class PoseGraph:
         changes = changes_of(
             np.array([chain.times_s[node] for node in nodes]),
             np.array([self._state(key)[2:] for key in keys]),
+            self._joint_covariance(keys, _BIAS, reckoned=True),
             self._joint_covariance(keys, _BIAS),
         )
-        self._walk = likely_walk(changes, self._walk, s.bias_walk, s.walk_factor)
+        self._walk *= likely_walk(changes, s.bias_walk, s.walk_factor) / expected_walk(changes)
 
     def _apart(self, owners: Mapping[int, int]) -> dict[int, Array]:
         """Return the covariance (2, 2) of the way between each node and its owner."""

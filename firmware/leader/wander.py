@@ -5,7 +5,7 @@ tidal current turns within the hour. Between epochs minutes apart the drift chan
 that the map and the ranges measure; how large such changes are tells how large to expect them.
 """
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,19 +14,28 @@ from firmware.geometry import Array
 
 _REACH = 16.0  # how far from the first belief a walk is looked for, up and down, as a factor
 _GRID = 41
+_TOLD = 0.99  # of the expected variance: what leaves more was told nothing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DriftChange:
-    """A change of drift: its interval, its estimate (2,) in m/s and the covariance (2, 2) of it."""
+    """A change of drift over an interval: what was expected of it, and what was found.
+
+    expected and found are covariances (2, 2) in (m/s)^2, before and after the map and the ranges
+    were asked; change_mps (2,) is the estimate.
+    """
 
     interval_s: float
+    expected: Array
     change_mps: Array
-    covariance: Array
+    found: Array
 
 
-def changes_of(times_s: Array, bias_mps: Array, covariance: Array) -> list[DriftChange]:
-    """Return the changes between successive epochs (K,) of a drift (K, 2), (2K, 2K)."""
+def changes_of(times_s: Array, bias_mps: Array, expected: Array, found: Array) -> list[DriftChange]:
+    """Return the changes between successive epochs (K,) of a drift (K, 2).
+
+    expected and found are the joint covariances (2K, 2K) before and after measurements.
+    """
     changes = []
     for k in range(1, len(times_s)):
         difference = np.zeros((2, 2 * len(times_s)))
@@ -35,33 +44,42 @@ def changes_of(times_s: Array, bias_mps: Array, covariance: Array) -> list[Drift
         changes.append(
             DriftChange(
                 interval_s=float(times_s[k] - times_s[k - 1]),
+                expected=difference @ expected @ difference.T,
                 change_mps=bias_mps[k] - bias_mps[k - 1],
-                covariance=difference @ covariance @ difference.T,
+                found=difference @ found @ difference.T,
             )
         )
     return changes
 
 
-def likely_walk(
-    changes: Iterable[DriftChange], assumed: float, believed: float, factor: float
-) -> float:
+def expected_walk(changes: Sequence[DriftChange]) -> float:
+    """Return the walk in m/s/sqrt(s) that an estimate expected, whatever it was told.
+
+    Vehicles whose drift is tied each bring an expectation of their own: together they expect less.
+    """
+    rates = [np.trace(change.expected) / (2.0 * change.interval_s) for change in changes]
+    return float(np.sqrt(np.mean(rates)))
+
+
+def likely_walk(changes: Sequence[DriftChange], believed: float, factor: float) -> float:
     """Return the walk in m/s/sqrt(s) that an estimate's changes of drift speak for.
 
-    The estimate assumed one walk: what its changes and their covariances hold of it is taken out
-    again. Before any evidence the walk is log-normal, may well be wrong by the factor, and has the
-    believed one as the root of its mean square. So has the answer, over what remains likely: little
-    evidence leaves more room for drift rather than less.
+    What the estimate expected is taken out of what it found; what is left was measured. Successive
+    changes are taken for independent, which neighbours are not quite. Before any evidence the walk
+    is log-normal, may well be wrong by the factor, and has the believed one as the root of its mean
+    square. So has the answer, over what remains likely: little evidence leaves more room for drift
+    rather than less.
     """
     walks = believed * np.geomspace(1 / _REACH, _REACH, _GRID)
     spread = np.log(factor)
     log_likely = -0.5 * (np.log(walks / believed) / spread + spread) ** 2
     for change in changes:
-        assumed_variance = assumed**2 * change.interval_s
-        variances, axes = np.linalg.eigh(change.covariance)
-        seen = variances < 0.999 * assumed_variance
-        kept_share = 1.0 - variances[seen] / assumed_variance
-        measured = (change.change_mps @ axes)[seen] / kept_share
-        noise = variances[seen] / kept_share
+        expected = np.trace(change.expected) / 2.0
+        variances, axes = np.linalg.eigh(change.found)
+        seen = variances < _TOLD * expected
+        told_share = 1.0 - variances[seen] / expected
+        measured = (change.change_mps @ axes)[seen] / told_share
+        noise = variances[seen] / told_share
         total = walks[:, None] ** 2 * change.interval_s + noise
         log_likely -= 0.5 * np.sum(np.log(total) + measured**2 / total, axis=1)
     weights = np.exp(log_likely - log_likely.max())

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from firmware.leader.atlas import Atlas, Sheet, SheetId, sheet_of
-from firmware.leader.closures import ClosureSettings, MatchJob, jobs_again
-from firmware.leader.matching import MatchingSettings, MatchOutcome, NoMatch
+from firmware.leader.closures import ClosureSettings, MatchJob, enter_hint, jobs_again
+from firmware.leader.matching import Hint, MatchingSettings, MatchOutcome, NoMatch
 from firmware.leader.open_pairs import OpenPairs
 from firmware.leader.pairing import Calibrations
 from firmware.leader.pose_graph import GraphSettings, PoseGraph
@@ -62,39 +62,40 @@ def _sheets(atlas: Atlas) -> list[Sheet]:
     return list(atlas)
 
 
-def test_ambiguous_pair_stays_open_with_its_sigma_and_its_hint(atlas: Atlas) -> None:
+def test_ambiguous_pair_stays_open_with_its_sigma_and_its_hint(
+    atlas: Atlas, graph: PoseGraph
+) -> None:
     first, second, *_ = _sheets(atlas)
     pairs = OpenPairs(8)
     pairs.note(_job(first, second, 9.0), AMBIGUOUS)
-    pairs.note_hint(first.id, second.id, 17)
+    pairs.note_hint(first.id, second.id, None)
     pairs.note(_job(first, second, 4.0), AMBIGUOUS)
-    assert pairs.hint(first.id, second.id) == 17
-    assert pairs.next_turn(atlas) == (second, [(first, 4.0)])
+    assert pairs.next_turn(atlas, graph) == (second, [(first, 4.0, None)])
 
 
-def test_settled_and_impossible_pairs_are_forgotten(atlas: Atlas) -> None:
+def test_settled_and_impossible_pairs_are_forgotten(atlas: Atlas, graph: PoseGraph) -> None:
     first, second, third, _ = _sheets(atlas)
     pairs = OpenPairs(8)
     for origin in (first, second):
         pairs.note(_job(origin, third, 9.0), AMBIGUOUS)
     pairs.settle(first.id, third.id)
-    assert pairs.next_turn(atlas) == (third, [(second, 9.0)])
+    assert pairs.next_turn(atlas, graph) == (third, [(second, 9.0, None)])
     pairs.note(_job(second, third, 3.0), UNSETTLED)
-    assert pairs.next_turn(atlas) is None
+    assert pairs.next_turn(atlas, graph) is None
     assert len(pairs) == 0
 
 
-def test_sheets_take_turns_and_shelved_ones_are_left_out(atlas: Atlas) -> None:
+def test_sheets_take_turns_and_shelved_ones_are_left_out(atlas: Atlas, graph: PoseGraph) -> None:
     first, second, third, fourth = _sheets(atlas)
     pairs = OpenPairs(8)
     for target in (second, third, fourth):
         pairs.note(_job(first, target, 9.0), AMBIGUOUS)
     atlas.shelve(third.id)
-    turns = [pairs.next_turn(atlas) for _ in range(3)]
+    turns = [pairs.next_turn(atlas, graph) for _ in range(3)]
     assert [turn[0].id.submap for turn in turns if turn is not None] == [1, 3, 1]
 
 
-def test_oldest_sheets_go_when_there_are_too_many(atlas: Atlas) -> None:
+def test_longest_unseen_sheets_go_when_there_are_too_many(atlas: Atlas) -> None:
     first, second, third, fourth = _sheets(atlas)
     pairs = OpenPairs(2)
     for target in (second, third, fourth):
@@ -103,20 +104,63 @@ def test_oldest_sheets_go_when_there_are_too_many(atlas: Atlas) -> None:
     assert pairs.hint(first.id, second.id) is None
 
 
-def test_only_a_much_better_known_offset_is_worth_a_second_look() -> None:
-    graph, track = PoseGraph(GraphSettings()), _long_track()
-    graph.add_vehicle(0, 0.0, np.zeros(2), np.zeros(2))
-    graph.extend(0, track)
-    graph.update()
-    origin, target = (
-        dataclasses.replace(_sheet(k, time_s), track=track) for k, time_s in ((1, 20.0), (2, 100.0))
+def test_pair_whose_hint_was_composed_away_is_passed_over(atlas: Atlas, graph: PoseGraph) -> None:
+    first, second, *_ = _sheets(atlas)
+    pairs = OpenPairs(8)
+    pairs.note(_job(first, second, 9.0), AMBIGUOUS)
+    pairs.note_hint(first.id, second.id, 10_000)
+    assert pairs.hint(first.id, second.id) == 10_000
+    assert 10_000 not in graph
+    assert pairs.next_turn(atlas, graph) is None
+
+
+def _two_sheets() -> tuple[Sheet, Sheet]:
+    first, second = (
+        dataclasses.replace(_sheet(k, time_s), track=_long_track())
+        for k, time_s in ((1, 20.0), (2, 100.0))
     )
-    settings = ClosureSettings()
-    for then_m, looks in ((1000.0, 1), (1.0, 0)):
-        jobs = jobs_again(
-            target, [(origin, then_m)], graph, settings, Calibrations(MatchingSettings())
-        )
-        assert len(jobs) == looks
+    return first, second
+
+
+def _looks(graph: PoseGraph, then_m: float, hint: int | None = None) -> list[MatchJob]:
+    origin, target = _two_sheets()
+    calibrations = Calibrations(MatchingSettings())
+    return jobs_again(target, [(origin, then_m, hint)], graph, ClosureSettings(), calibrations)
+
+
+def test_only_a_much_better_known_offset_is_worth_a_second_look(graph: PoseGraph) -> None:
+    (job,) = _looks(graph, 1e6)
+    limit_m = job.prior_sigma_m / ClosureSettings().second_look_share
+    assert len(_looks(graph, 1.01 * limit_m)) == 1
+    assert _looks(graph, 0.99 * limit_m) == []
+
+
+def test_what_the_pair_itself_has_told_does_not_make_it_better_known(graph: PoseGraph) -> None:
+    (before,) = _looks(graph, 1e6)
+    hint = enter_hint(
+        before,
+        Hint(shift_m=np.array([7.0, -4.0]), covariance_m2=0.1 * before.prior_covariance_m2),
+        graph,
+        dataclasses.replace(ClosureSettings(), hint_prior_m=0.0),
+    )
+    graph.update()
+    (deceived,) = _looks(graph, 1e6)
+    assert deceived.prior_sigma_m < 0.6 * before.prior_sigma_m
+    (after,) = _looks(graph, 1e6, hint)
+    assert after.prior_covariance_m2 == pytest.approx(
+        before.prior_covariance_m2, rel=1e-3, abs=1e-3
+    )
+    assert after.prior_shift_m == pytest.approx(before.prior_shift_m, abs=1e-2)
+    assert _looks(graph, before.prior_sigma_m, hint) == []
+
+
+@pytest.fixture
+def graph() -> PoseGraph:
+    graph = PoseGraph(GraphSettings())
+    graph.add_vehicle(0, 0.0, np.zeros(2), np.zeros(2))
+    graph.extend(0, _long_track())
+    graph.update()
+    return graph
 
 
 def _long_track() -> Track:

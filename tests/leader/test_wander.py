@@ -6,7 +6,7 @@ import pytest
 from firmware.geometry import Array
 from firmware.leader.composition import CompositionSettings
 from firmware.leader.pose_graph import GraphSettings, PoseGraph
-from firmware.leader.wander import DriftChange, changes_of, likely_walk
+from firmware.leader.wander import DriftChange, changes_of, expected_walk, likely_walk
 from firmware.submaps import Track
 
 INTERVAL_S = 300.0
@@ -26,8 +26,9 @@ def _changes(
         changes.append(
             DriftChange(
                 interval_s=INTERVAL_S,
+                expected=prior * np.eye(2),
                 change_mps=gain * measured_mps,
-                covariance=gain * noise * np.eye(2),
+                found=gain * noise * np.eye(2),
             )
         )
     return changes
@@ -37,35 +38,51 @@ def _changes(
 @pytest.mark.parametrize("assumed", [0.001, 0.004])
 def test_walk_is_found_whatever_the_estimate_assumed(walk: float, assumed: float) -> None:
     changes = _changes(np.random.default_rng(5), walk, assumed, noise_mps=0.01, count=200)
-    assert likely_walk(changes, assumed, BELIEVED, FACTOR) == pytest.approx(walk, rel=0.3)
+    assert likely_walk(changes, BELIEVED, FACTOR) == pytest.approx(walk, rel=0.3)
 
 
 def test_without_evidence_the_belief_stays() -> None:
+    told_nothing = BELIEVED**2 * INTERVAL_S * np.eye(2)
     blind = DriftChange(
-        interval_s=INTERVAL_S,
-        change_mps=np.zeros(2),
-        covariance=BELIEVED**2 * INTERVAL_S * np.eye(2),
+        interval_s=INTERVAL_S, expected=told_nothing, change_mps=np.zeros(2), found=told_nothing
     )
     for changes in ([], [blind] * 20):
-        found = likely_walk(changes, BELIEVED, BELIEVED, FACTOR)
+        found = likely_walk(changes, BELIEVED, FACTOR)
         assert found == pytest.approx(BELIEVED, rel=0.05)
 
 
 def test_little_evidence_moves_it_little() -> None:
     rng = np.random.default_rng(6)
-    few = likely_walk(_changes(rng, 0.0, BELIEVED, 0.01, 1), BELIEVED, BELIEVED, FACTOR)
-    many = likely_walk(_changes(rng, 0.0, BELIEVED, 0.01, 50), BELIEVED, BELIEVED, FACTOR)
+    few = likely_walk(_changes(rng, 0.0, BELIEVED, 0.01, 1), BELIEVED, FACTOR)
+    many = likely_walk(_changes(rng, 0.0, BELIEVED, 0.01, 50), BELIEVED, FACTOR)
     assert many < 0.3 * BELIEVED < 0.5 * BELIEVED < few < BELIEVED
 
 
 def test_changes_are_between_successive_epochs() -> None:
-    covariance = np.diag(np.arange(1.0, 7.0))
-    first, second = changes_of(
-        np.array([0.0, 300.0, 500.0]), np.array([[0.0, 0.0], [1.0, 2.0], [1.5, 1.0]]), covariance
-    )
-    assert (first.interval_s, second.interval_s) == (300.0, 200.0)
-    assert np.allclose(second.change_mps, [0.5, -1.0])
-    assert np.allclose(first.covariance, np.diag([1.0 + 3.0, 2.0 + 4.0]))
+    found = np.diag(np.arange(1.0, 7.0))
+    bias_mps = np.array([[0.0, 0.0], [1.0, 2.0], [1.5, 1.0]])
+    changes = changes_of(np.array([0.0, 300.0, 500.0]), bias_mps, 10.0 * found, found)
+    assert [change.interval_s for change in changes] == [300.0, 200.0]
+    assert np.allclose(changes[1].change_mps, [0.5, -1.0])
+    assert np.allclose(changes[0].found, np.diag([1.0 + 3.0, 2.0 + 4.0]))
+    assert expected_walk(changes[:1]) == pytest.approx(np.sqrt(50.0 / INTERVAL_S))
+
+
+@pytest.mark.parametrize("vehicles", [1, 2, 3])
+def test_vehicles_that_share_a_drift_do_not_vouch_for_stillness(vehicles: int) -> None:
+    """Composed again and again with nothing measured, the graph goes on to expect the same."""
+    times_s = np.arange(2401.0)
+    track = Track(time_s=times_s, north_m=2 * times_s, east_m=0 * times_s, yaw_rad=0 * times_s)
+    graph = PoseGraph(GraphSettings())
+    for vehicle in range(vehicles):
+        graph.add_vehicle(vehicle, 0.0, np.zeros(2), np.zeros(2))
+        graph.extend(vehicle, track)
+    for _ in range(4):
+        graph.compose(2400.0, CompositionSettings())
+        keys = [graph._chains[0].key_at(time_s) for time_s in (1800.0, 2400.0)]
+        joint = graph._solver.covariance([key for key in keys if key is not None])[2::4, 2::4]
+        walk = np.sqrt((joint[0, 0] + joint[1, 1] - 2 * joint[0, 1]) / 600.0)
+        assert walk == pytest.approx(BELIEVED, rel=0.1)
 
 
 def _laps(current_mps: Array, rng: np.random.Generator) -> PoseGraph:

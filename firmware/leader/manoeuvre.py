@@ -30,7 +30,9 @@ class ManoeuvreSettings(Settings):
     range_sigma_m: float = setting(2.0, "m", "of a predicted range", minimum=0.1)
     closure_floor_m: float = setting(0.4, "m", "no closure tells more", minimum=0.01)
     odometry_noise: float = setting(0.2, "m/sqrt(s)", "as in the graph", minimum=1e-4)
-    bias_walk: float = setting(0.002, "m/s/sqrt(s)", "of the drift that all share", minimum=1e-7)
+    bias_walk: float = setting(
+        0.002, "m/s/sqrt(s)", "that all share; alike for all headings, it ranks none", minimum=1e-7
+    )
     bias_walk_apart: float = setting(0.0007, "m/s/sqrt(s)", "of each one's own", minimum=1e-7)
     worth: float = setting(
         0.8, "1", "of the uncertainty that going on leaves; else nothing is proposed", minimum=0.01

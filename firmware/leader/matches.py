@@ -139,8 +139,9 @@ class Match:
 class Hint:
     """What a pair that gave no closure still says of the shift, as a Gaussian.
 
-    It is the factor that takes the prior to the first two moments of the posterior: wide where
-    several shifts compete, and narrower along an axis that they share.
+    It is the factor that takes the prior to the first two moments of the posterior, widened by
+    `hint_scale` and `hint_floor_m`: wide where several shifts compete, and narrower along an axis
+    that they share.
     """
 
     shift_m: Array

@@ -116,7 +116,7 @@ def _search(
 def _hint(
     problem: PairProblem, surface: ErrorSurface, relief: ambiguity.Relief, prior: _Prior
 ) -> Hint | None:
-    """Return the factor between the prior and the moments of the posterior, None if it is weak."""
+    """Return the factor between prior and moments of the posterior, widened; None if it is weak."""
     misfit = surface.residual_m2 / surface.noise_m2
     is_own = not (problem.reference.reconstructed or problem.query.reconstructed)
     scale = max(1.2 * float(misfit.min()), _WARPED_NOISE if is_own else 0.5)

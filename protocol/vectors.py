@@ -50,8 +50,7 @@ def _ramp(rows: int, columns: int, start: float) -> Array32:
     return cast(Array32, values.astype(np.float32).reshape(rows, columns))
 
 
-def packets() -> dict[str, Packet]:
-    """Return one packet or more of every plain profile, by the name of its vector."""
+def _paper_packets() -> dict[str, Packet]:
     paper = SubmapPacket(
         header=_header(Profile.SUBMAP_PAPER),
         trajectory=_ramp(4, 3, -100.0),
@@ -63,14 +62,6 @@ def packets() -> dict[str, Packet]:
     absurd = paper.points_ned_m.copy()
     absurd[0] = (np.inf, -np.inf, np.nan)
     absurd[1] = (3.0e38, -3.0e38, 1.0e-45)
-    single = {"fragment": 0, "fragment_count": 1}
-    answer = Answer(
-        header=_header(Profile.ANSWER, vehicle=0, boot_epoch=1, fragment=2, fragment_count=5),
-        submap=0x1234,
-        north_m=123.5,
-        east_m=-4567.25,
-    )
-    body = bytes(range(244))
     return {
         "paper": paper,
         "paper, two states unused": replace(paper, trajectory=unused),
@@ -88,6 +79,21 @@ def packets() -> dict[str, Packet]:
                 time_quarters=0xFFFFF,
             ),
         ),
+    }
+
+
+def packets() -> dict[str, Packet]:
+    """Return one packet or more of every plain profile, by the name of its vector."""
+    single = {"fragment": 0, "fragment_count": 1}
+    answer = Answer(
+        header=_header(Profile.ANSWER, vehicle=0, boot_epoch=1, fragment=2, fragment_count=5),
+        submap=0x1234,
+        north_m=123.5,
+        east_m=-4567.25,
+    )
+    body = bytes(range(244))
+    return {
+        **_paper_packets(),
         "answer": answer,
         "answer to a vehicle 0 in epoch 0": replace(
             answer, header=_header(Profile.ANSWER, fragment=0, fragment_count=0)

@@ -22,9 +22,7 @@ from firmware.leader.closures import (
     MatchJob,
     closure_of,
     corrections,
-    enter_hint,
     gated,
-    jobs_again,
     jobs_for,
 )
 from firmware.leader.composition import detail_from_s
@@ -129,7 +127,7 @@ class LeaderCore:
         )
         self._calibrations = Calibrations(settings.matching)
         self._judgement = Judgement(settings.judgement, settings.matching, self._calibrations)
-        self._open = OpenPairs(settings.closures.open_submaps)
+        self._open = OpenPairs(settings.closures)
         self._sheets_judged = 0
         self._jobs_out = False
         self.composed_s = start.time_s
@@ -215,7 +213,8 @@ class LeaderCore:
         except EstimationError:
             self.counters["submaps_unplaceable"] += 1
             jobs = []
-        return SheetJobs(sheet=sheet, jobs=(*jobs, *self._second_looks(sheet)))
+        looks = self._open.second_looks(sheet, self.atlas, self.graph, self._calibrations)
+        return SheetJobs(sheet=sheet, jobs=(*jobs, *looks))
 
     def finish(self, done: SheetJobs, outcomes: list[MatchOutcome], now_s: float) -> None:
         """Judge what the matches of one sheet found, and bring the estimate up to it."""
@@ -224,7 +223,7 @@ class LeaderCore:
             if outcome.reason is not None:
                 self.counters[f"match_{outcome.reason.name.lower()}"] += 1
             try:
-                self._keep_or_settle(job, outcome)
+                self._open.keep_or_settle(job, outcome, self.graph, self._judgement)
                 closure = closure_of(job, outcome, self.graph, now_s)
             except EstimationError:
                 self.counters["closures_unplaceable"] += 1
@@ -311,6 +310,7 @@ class LeaderCore:
             **self._ranging.counters,
             **self._fixes.counters,
             **self._judgement.counters,
+            **self._open.counters,
             **{
                 f"reassembly_{k}": v
                 for k, v in dataclasses.asdict(self._reassembler.counters).items()
@@ -320,7 +320,6 @@ class LeaderCore:
             "bad_pings": self._builder.bad_pings,
             "graph_rebuilds": self.graph.rebuilds,
             "open_submaps": len(self._open),
-            "open_submaps_dropped": self._open.dropped,
             **self._outlook(),
         }
 
@@ -349,43 +348,6 @@ class LeaderCore:
             return None
 
     # inside
-
-    def _second_looks(self, sheet: Sheet) -> Iterator[MatchJob]:
-        """Yield matches of pairs that were left open, and whose offset is known better by now.
-
-        Each sheet has one turn at most beside a new one, and no more pairs than that are tried.
-        """
-        settings, seen, looks = self._settings.closures, {sheet.id}, 0
-        for _ in range(settings.second_looks):
-            turn = self._open.next_turn(self.atlas, self.graph)
-            if turn is None or turn[0].id in seen or looks >= settings.pairs_per_submap:
-                return
-            seen.add(turn[0].id)
-            try:
-                jobs = jobs_again(*turn, self.graph, settings, self._calibrations)
-            except EstimationError:
-                self.counters["second_looks_unplaceable"] += 1
-                continue
-            looks += len(jobs)
-            self.counters["second_looks"] += len(jobs)
-            yield from jobs
-
-    def _keep_or_settle(self, job: MatchJob, outcome: MatchOutcome) -> None:
-        """Keep a pair open with the hint of its first look; a match takes the hint's place.
-
-        The hint goes before the match is gated, lest what the pair has told count twice.
-        """
-        pair = job.origin.id, job.target.id
-        hint = self._open.hint(*pair)
-        self._open.note(job, outcome)
-        if outcome.match is not None:
-            self._open.settle(*pair)
-            if hint is not None:
-                self._judgement.drop_hint(hint, self.graph)
-        elif outcome.hint is not None and hint is None:
-            number = enter_hint(job, outcome.hint, self.graph, self._settings.closures)
-            self._judgement.note_hint(number)
-            self._open.note_hint(*pair, number)
 
     def _outlook(self) -> dict[str, int]:
         """Return the last observation in numbers for a status line."""

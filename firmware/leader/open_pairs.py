@@ -4,13 +4,16 @@ Where relief is faint a match finds several places, and the prior cannot tell th
 closures narrow the prior later; then one place is left, and the pair becomes a closure after all.
 """
 
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from dataclasses import dataclass, replace
 
 from firmware.leader.atlas import Atlas, Sheet, SheetId
-from firmware.leader.closures import MatchJob
+from firmware.leader.closures import ClosureSettings, MatchJob, enter_hint, jobs_again
+from firmware.leader.judgement import Judgement
 from firmware.leader.matching import MatchOutcome, NoMatch
+from firmware.leader.pairing import Calibrations
 from firmware.leader.pose_graph import PoseGraph
+from protocol.errors import EstimationError
 
 _OPEN = (NoMatch.AMBIGUOUS, NoMatch.LOOSE)  # what a narrower prior may decide
 
@@ -26,9 +29,9 @@ class OpenPair:
 class OpenPairs:
     """Open pairs by the sheet that was matched, bounded by the number of such sheets."""
 
-    def __init__(self, capacity: int) -> None:
-        self.dropped = 0
-        self._capacity = capacity
+    def __init__(self, settings: ClosureSettings) -> None:
+        self.counters: Counter[str] = Counter()
+        self._settings = settings
         self._of: OrderedDict[SheetId, dict[SheetId, OpenPair]] = OrderedDict()
 
     def note(self, job: MatchJob, outcome: MatchOutcome) -> None:
@@ -40,9 +43,9 @@ class OpenPairs:
             self._of[job.target.id] = pairs
         elif outcome.match is None:
             self.settle(job.origin.id, job.target.id)
-        while len(self._of) > self._capacity:
+        while len(self._of) > self._settings.open_submaps:
             self._of.popitem(last=False)
-            self.dropped += 1
+            self.counters["open_submaps_dropped"] += 1
 
     def hint(self, origin: SheetId, target: SheetId) -> int | None:
         """Return the hint that a look at the pair has left, if any."""
@@ -81,6 +84,46 @@ class OpenPairs:
                 self._of[target] = pairs
                 return atlas[target], partners
         return None
+
+    def second_looks(
+        self, sheet: Sheet, atlas: Atlas, graph: PoseGraph, calibrations: Calibrations
+    ) -> list[MatchJob]:
+        """Return matches of open pairs whose offset is known better by now, beside a new sheet.
+
+        Each sheet has one turn at most, and no more pairs than the new one's are tried.
+        """
+        seen, looks = {sheet.id}, list[MatchJob]()
+        for _ in range(self._settings.second_looks):
+            turn = self.next_turn(atlas, graph)
+            if turn is None or turn[0].id in seen or len(looks) >= self._settings.pairs_per_submap:
+                break
+            seen.add(turn[0].id)
+            try:
+                looks += jobs_again(*turn, graph, self._settings, calibrations)
+            except EstimationError:
+                self.counters["second_looks_unplaceable"] += 1
+        self.counters["second_looks"] += len(looks)
+        return looks
+
+    def keep_or_settle(
+        self, job: MatchJob, outcome: MatchOutcome, graph: PoseGraph, judgement: Judgement
+    ) -> None:
+        """Keep a pair open with the first hint that a look left; a match takes the hint's place.
+
+        The hint goes before the match is gated, lest what the pair has told count twice. Raises
+        EstimationError where a sub-map hangs on no node.
+        """
+        pair = job.origin.id, job.target.id
+        hint = self.hint(*pair)
+        self.note(job, outcome)
+        if outcome.match is not None:
+            self.settle(*pair)
+            if hint is not None:
+                judgement.drop_hint(hint, graph)
+        elif outcome.hint is not None and hint is None:
+            number = enter_hint(job, outcome.hint, graph, self._settings)
+            judgement.note_hint(number)
+            self.note_hint(*pair, number)
 
     def __len__(self) -> int:
         return len(self._of)

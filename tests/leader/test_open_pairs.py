@@ -1,12 +1,14 @@
 """A pair that a match left open is looked at again once its offset is known much better."""
 
 import dataclasses
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 
 from firmware.leader.atlas import Atlas, Sheet, SheetId, sheet_of
 from firmware.leader.closures import ClosureSettings, MatchJob, enter_hint, jobs_again
+from firmware.leader.judgement import Judgement, JudgementSettings
 from firmware.leader.matching import Hint, MatchingSettings, MatchOutcome, NoMatch
 from firmware.leader.open_pairs import OpenPairs
 from firmware.leader.pairing import Calibrations
@@ -66,7 +68,7 @@ def test_ambiguous_pair_stays_open_with_its_sigma_and_its_hint(
     atlas: Atlas, graph: PoseGraph
 ) -> None:
     first, second, *_ = _sheets(atlas)
-    pairs = OpenPairs(8)
+    pairs = OpenPairs(ClosureSettings())
     pairs.note(_job(first, second, 9.0), AMBIGUOUS)
     pairs.note_hint(first.id, second.id, None)
     pairs.note(_job(first, second, 4.0), AMBIGUOUS)
@@ -75,7 +77,7 @@ def test_ambiguous_pair_stays_open_with_its_sigma_and_its_hint(
 
 def test_settled_and_impossible_pairs_are_forgotten(atlas: Atlas, graph: PoseGraph) -> None:
     first, second, third, _ = _sheets(atlas)
-    pairs = OpenPairs(8)
+    pairs = OpenPairs(ClosureSettings())
     for origin in (first, second):
         pairs.note(_job(origin, third, 9.0), AMBIGUOUS)
     pairs.settle(first.id, third.id)
@@ -87,7 +89,7 @@ def test_settled_and_impossible_pairs_are_forgotten(atlas: Atlas, graph: PoseGra
 
 def test_sheets_take_turns_and_shelved_ones_are_left_out(atlas: Atlas, graph: PoseGraph) -> None:
     first, second, third, fourth = _sheets(atlas)
-    pairs = OpenPairs(8)
+    pairs = OpenPairs(ClosureSettings())
     for target in (second, third, fourth):
         pairs.note(_job(first, target, 9.0), AMBIGUOUS)
     atlas.shelve(third.id)
@@ -97,7 +99,7 @@ def test_sheets_take_turns_and_shelved_ones_are_left_out(atlas: Atlas, graph: Po
 
 def test_longest_unseen_sheets_go_when_there_are_too_many(atlas: Atlas) -> None:
     first, second, third, fourth = _sheets(atlas)
-    pairs = OpenPairs(2)
+    pairs = OpenPairs(ClosureSettings(open_submaps=2))
     for target in (second, third, fourth):
         pairs.note(_job(first, target, 9.0), AMBIGUOUS)
     assert len(pairs) == 2
@@ -106,7 +108,7 @@ def test_longest_unseen_sheets_go_when_there_are_too_many(atlas: Atlas) -> None:
 
 def test_pair_whose_hint_was_composed_away_is_passed_over(atlas: Atlas, graph: PoseGraph) -> None:
     first, second, *_ = _sheets(atlas)
-    pairs = OpenPairs(8)
+    pairs = OpenPairs(ClosureSettings())
     pairs.note(_job(first, second, 9.0), AMBIGUOUS)
     pairs.note_hint(first.id, second.id, 10_000)
     assert pairs.hint(first.id, second.id) == 10_000
@@ -152,6 +154,35 @@ def test_what_the_pair_itself_has_told_does_not_make_it_better_known(graph: Pose
     )
     assert after.prior_shift_m == pytest.approx(before.prior_shift_m, abs=1e-2)
     assert _looks(graph, before.prior_sigma_m, hint) == []
+
+
+def test_no_sheet_has_two_turns_beside_a_new_one(atlas: Atlas, graph: PoseGraph) -> None:
+    first, second, third, fourth = _sheets(atlas)
+    pairs = OpenPairs(ClosureSettings(second_look_share=1e6))
+    for target in (second, third):
+        pairs.note(_job(first, target, 9.0), AMBIGUOUS)
+    atlas.shelve(second.id)
+    calibrations = Calibrations(MatchingSettings())
+    pairs.second_looks(fourth, atlas, graph, calibrations)
+    assert len(pairs) == 1
+    assert pairs.second_looks(third, atlas, graph, calibrations) == []
+
+
+def test_match_takes_the_place_of_the_hint(graph: PoseGraph) -> None:
+    (job,) = _looks(graph, 1e6)
+    hint = Hint(shift_m=np.array([7.0, -4.0]), covariance_m2=0.1 * job.prior_covariance_m2)
+    pairs = OpenPairs(dataclasses.replace(ClosureSettings(), hint_prior_m=0.0))
+    judgement = Judgement(JudgementSettings(), MatchingSettings())
+    pairs.keep_or_settle(job, dataclasses.replace(AMBIGUOUS, hint=hint), graph, judgement)
+    number = pairs.hint(job.origin.id, job.target.id)
+    assert graph.is_active(number)
+    pairs.keep_or_settle(job, dataclasses.replace(AMBIGUOUS, hint=hint), graph, judgement)
+    assert pairs.hint(job.origin.id, job.target.id) == number
+    assert judgement.counters["hints_taken"] == 1
+    found = MatchOutcome(match=MagicMock(), reason=None)
+    pairs.keep_or_settle(job, found, graph, judgement)
+    assert not graph.is_active(number)
+    assert len(pairs) == 0
 
 
 @pytest.fixture

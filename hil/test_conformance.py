@@ -189,7 +189,7 @@ def test_t07_submap_and_answer(open_ends: OpenEnds) -> None:
 
 
 def test_t08_mission(open_ends: OpenEnds, record_testsuite_property: Record) -> None:
-    """The vehicles' own programs: sub-maps placed by the leader, an answer heard by the follower."""
+    """The vehicles' own programs: sub-maps placed by the leader, an answer heard in return."""
     ends = ready(open_ends(0.14))
     mission, end_s = BenchMission(ends.bench), ends.bench.now_s + MISSION_S
     while ends.bench.now_s < end_s and not mission.is_done():

@@ -6,6 +6,7 @@ from typing import overload
 
 from firmware.compression.choice import chosen_frames
 from firmware.compression.dense import dense_code_steps
+from firmware.compression.expected import Watched
 from firmware.compression.lattice import lattice_code_steps
 from firmware.compression.packing import filled_bytes, packets_from
 from firmware.compression.points import compress_point_steps, report_of, unfitted, usable
@@ -18,7 +19,6 @@ from firmware.compression.results import (
 from firmware.compression.settings import CompressionSettings
 from firmware.compression.track_code import USUAL_TRACK_BYTES
 from firmware.submaps import BinnedSoundings
-from protocol.errors import EstimationError
 from protocol.lattice import PROTECTION_BYTES
 from protocol.packets import Profile
 
@@ -109,16 +109,8 @@ def _dense_steps(bins: BinnedSoundings, settings: CompressionSettings) -> Iterat
     bins = usable(bins)
     best: Compressed = unfitted(bins, settings)
     yield best
-    steps = dense_code_steps(bins, settings, filled_bytes(Profile.SUBMAP_DENSE, settings))
-    while True:
-        try:
-            step = next(steps)
-        except StopIteration as stop:
-            ended = str(stop.value)
-            break
-        except EstimationError as error:  # not to be factorised at any nugget
-            ended = str(error)
-            break
+    fit = Watched(dense_code_steps(bins, settings, filled_bytes(Profile.SUBMAP_DENSE, settings)))
+    for step in fit:
         if step is not None:
             code, fitted = step
             best = CompressedCode(
@@ -129,4 +121,4 @@ def _dense_steps(bins: BinnedSoundings, settings: CompressionSettings) -> Iterat
                 report=report_of(fitted),
             )
         yield best
-    yield dataclasses.replace(best, report=dataclasses.replace(best.report, ended=ended))
+    yield dataclasses.replace(best, report=dataclasses.replace(best.report, ended=fit.ended))

@@ -14,7 +14,7 @@ derivatives: no sampling, and two passes over the soundings whatever the number 
 import dataclasses
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ from firmware.compression.kernels import (
 )
 from firmware.compression.losses import LossPatterns
 from firmware.geometry import Array
+from protocol.errors import EstimationError
 
 _STEP_WORK = 10240 * 150**2  # rows x points^2 of a step: under 10 ms
 _ROOM_ROWS = 192 * 150  # rows x points held at once: they stay in the cache
@@ -345,3 +346,17 @@ def stepping(steps: Generator[None, None, T]) -> Iterator[T | None]:
             yield stop.value
             return
         yield None
+
+
+class Watched(Generic[T]):
+    """The steps of a fit, which may end by a factorisation that failed; `ended` then says how."""
+
+    def __init__(self, steps: Generator[T, None, str]) -> None:
+        self.ended = "not fitted"
+        self._steps = steps
+
+    def __iter__(self) -> Iterator[T]:
+        try:
+            self.ended = yield from self._steps
+        except EstimationError as error:  # not to be factorised at any nugget
+            self.ended = str(error)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from firmware.compression.binning import coarsened
 from firmware.compression.calibration import calibrated
-from firmware.compression.expected import stepping
+from firmware.compression.expected import Watched, stepping
 from firmware.compression.fit import (
     FitFrame,
     FittedPoints,
@@ -67,19 +67,11 @@ def compress_point_steps(
     if expected:
         coarse = coarsened(targets, settings.placing_cell_m)
         frame = fit_frame(coarse, settings.max_fit_rows, fine)
-    fit = fit_steps if expected else fitc_steps
-    steps = fit(frame, count, settings, dealt_evenly(PAPER_FRAGMENTS, settings))
+    steps = fit_steps if expected else fitc_steps
+    fit = Watched(steps(frame, count, settings, dealt_evenly(PAPER_FRAGMENTS, settings)))
     waiting: FittedPoints | None = None
     packed_at = 0
-    while True:
-        try:
-            step = next(steps)
-        except StopIteration as stop:
-            ended = str(stop.value)
-            break
-        except EstimationError as error:  # not to be factorised at any nugget
-            ended = str(error)
-            break
+    for step in fit:
         waiting = step or waiting
         if step is not None and (not packed_at or step.evaluations >= packed_at + _PACK_EVERY):
             packed_at, waiting = step.evaluations, None
@@ -87,7 +79,7 @@ def compress_point_steps(
         yield best
     if waiting is not None:
         best = yield from _pack_steps(waiting, fine, bins, best, settings)
-    yield dataclasses.replace(best, report=dataclasses.replace(best.report, ended=ended))
+    yield dataclasses.replace(best, report=dataclasses.replace(best.report, ended=fit.ended))
 
 
 def usable(bins: BinnedSoundings) -> BinnedSoundings:

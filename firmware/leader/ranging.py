@@ -89,7 +89,7 @@ class Ranging:
         waiting = self._waiting.setdefault(chain, deque())
         for held in ready:
             self._join(waiting, held)
-        undecided: deque[list[_HeldRange]] = deque()
+        still: deque[list[_HeldRange]] = deque()
         while waiting:
             window = waiting.pop()
             placed = self._placed(window, (receiver, receiver_track), (chain, track), graph)
@@ -97,10 +97,10 @@ class Ranging:
             if fate is _Fate.ENTERED:
                 graph.update()
                 continue
-            undecided.appendleft(window)
+            still.appendleft(window)
             if fate is _Fate.BENT:
                 break
-        waiting.extend(undecided)
+        waiting.extend(still)
 
     def _join(self, waiting: deque[list[_HeldRange]], held: _HeldRange) -> None:
         """Let a range wait with the newest window, or begin a new one; bounded."""

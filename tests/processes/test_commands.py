@@ -226,7 +226,9 @@ def test_two_processes_with_a_key_map_together_in_every_profile(
     leader = json.loads((out / "processes" / "leader.json").read_text())
     came = leader["reassembly_complete"] + leader["reassembly_partial"]
     assert came >= 2
-    assert leader.get("submaps_empty", 0) + leader.get("submaps_not_rebuilt", 0) < came
+    unbuilt = leader.get("submaps_empty", 0) + leader.get("submaps_not_rebuilt", 0)
+    hardly_fits = "follower.compression.small_frames=1" in profile  # beside a track that bends
+    assert unbuilt <= (came - 1 if hardly_fits else 0)
 
 
 @pytest.mark.slow

@@ -9,10 +9,10 @@ from firmware.leader.composition import CompositionSettings
 from firmware.leader.coverage import CoverageSettings
 from firmware.leader.fixes import FixSettings
 from firmware.leader.fleet import FleetSettings
+from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.judgement import JudgementSettings
 from firmware.leader.manoeuvre import ManoeuvreSettings
 from firmware.leader.matching import MatchingSettings
-from firmware.leader.pose_graph import GraphSettings
 from firmware.leader.ranges import RangeSettings
 from firmware.leader.reconstruction import ReconstructionSettings
 from firmware.soundings import SonarSettings

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from firmware.follower.correction import CorrectionSettings, DriftCorrection
-from firmware.leader.pose_graph import GraphSettings, PoseGraph
+from firmware.leader.graph_settings import GraphSettings
+from firmware.leader.pose_graph import PoseGraph
 
 SETTINGS = CorrectionSettings()
 HERE_M = np.array([300.0, -40.0])

@@ -10,6 +10,7 @@ import pytest
 from firmware.geometry import Array
 from firmware.leader.chains import Chain
 from firmware.leader.composition import CompositionSettings, kept_nodes
+from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.ledger import (
     ClosureRecord,
     OdometryRecord,
@@ -17,7 +18,7 @@ from firmware.leader.ledger import (
     Record,
     SharedWalkRecord,
 )
-from firmware.leader.pose_graph import GraphSettings, PoseGraph
+from firmware.leader.pose_graph import PoseGraph
 from firmware.submaps import Track
 
 HOURS, LAP_S = 1.5, 400

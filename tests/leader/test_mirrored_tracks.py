@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from firmware.geometry import Array
-from firmware.leader.pose_graph import GraphSettings, PoseGraph
+from firmware.leader.graph_settings import GraphSettings
+from firmware.leader.pose_graph import PoseGraph
 from firmware.leader.ranges import RangeSettings
 from firmware.leader.ranging import Ranging
 from firmware.submaps import Track

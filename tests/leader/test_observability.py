@@ -5,8 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.observability import Observability, observe
-from firmware.leader.pose_graph import GraphSettings, PoseGraph
+from firmware.leader.pose_graph import PoseGraph
 from firmware.submaps import Track
 
 SECONDS, APART_M = 900, 400.0

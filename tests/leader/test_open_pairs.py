@@ -8,11 +8,12 @@ import pytest
 
 from firmware.leader.atlas import Atlas, Sheet, SheetId, sheet_of
 from firmware.leader.closures import ClosureSettings, MatchJob, enter_hint, jobs_again
+from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.judgement import Judgement, JudgementSettings
 from firmware.leader.matching import Hint, MatchingSettings, MatchOutcome, NoMatch
 from firmware.leader.open_pairs import OpenPairs
 from firmware.leader.pairing import Calibrations
-from firmware.leader.pose_graph import GraphSettings, PoseGraph
+from firmware.leader.pose_graph import PoseGraph
 from firmware.submaps import GriddedSubmap, Track
 
 AMBIGUOUS = MatchOutcome(match=None, reason=NoMatch.AMBIGUOUS)

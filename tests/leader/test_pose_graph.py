@@ -5,8 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.ledger import OdometryRecord, PriorRecord, RangeRecord, SharedDriftRecord
-from firmware.leader.pose_graph import GraphSettings, PoseGraph
+from firmware.leader.pose_graph import PoseGraph
 from firmware.submaps import Track
 from protocol.errors import EstimationError
 

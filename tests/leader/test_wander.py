@@ -5,7 +5,8 @@ import pytest
 
 from firmware.geometry import Array
 from firmware.leader.composition import CompositionSettings
-from firmware.leader.pose_graph import GraphSettings, PoseGraph
+from firmware.leader.graph_settings import GraphSettings
+from firmware.leader.pose_graph import PoseGraph
 from firmware.leader.wander import DriftChange, changes_of, expected_walk, likely_walk
 from firmware.submaps import Track
 

@@ -1,0 +1,70 @@
+"""What the pose graph believes of dead reckoning and of what it is told, before a mission tells."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from protocol.settings import Settings, setting
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GraphSettings(Settings):
+    """What the graph believes of dead reckoning, closures and ranges."""
+
+    node_interval_s: float = setting(
+        10.0, "s", "key-frame spacing; dead reckoning adds 0.6 m of noise in it", minimum=1.0
+    )
+    start_sigma_m: float = setting(
+        0.5, "m", "uncertainty of each start in the common datum", minimum=1e-3
+    )
+    odometry_noise: float = setting(
+        0.2, "m/sqrt(s)", "random part of dead reckoning: variance 0.04 a second", minimum=1e-4
+    )
+    bias_sigma_mps: float = setting(
+        0.2, "m/s", "unmeasured current at the start, each axis", minimum=1e-4
+    )
+    bias_difference_mps: float = setting(
+        0.2, "m/s", "vehicles drift in the same water: their biases differ by less", minimum=1e-4
+    )
+    bias_walk: float = setting(
+        0.004, "m/s/sqrt(s)", "lets a current of 0.2 m/s turn within an hour", minimum=1e-7
+    )
+    walk_factor: float = setting(
+        2.0, "1", "by which that may well be wrong, until the mission tells", minimum=1.01
+    )
+    walk_interval_s: float = setting(
+        300.0, "s", "over which drift is compared to learn it: half a survey line", minimum=60.0
+    )
+    walk_memory_s: float = setting(3600.0, "s", "of drift that is compared", minimum=600.0)
+    walk_apart: float = setting(
+        0.175, "1", "of it is one vehicle's own: a current turns for all in it alike", minimum=1e-3
+    )
+    alike_interval_s: float = setting(
+        60.0, "s", "how often that is said: chains stay loosely coupled", minimum=10.0
+    )
+    heading_bias_sigma_deg: float = setting(
+        0.5, "degree", "mounting error of the attitude reference", minimum=1e-6
+    )
+    log_scale_sigma: float = setting(0.005, "1", "scale error of the Doppler log", minimum=1e-9)
+    range_sigma_m: float = setting(
+        1.5,
+        "m",
+        "noise of a range (1 m, Eq. 13), of the way to its key frames, and bend",
+        minimum=1e-3,
+    )
+    closure_floor_m: float = setting(
+        0.4, "m", "strain within a sub-map that no match can see", minimum=0.0
+    )
+    robust_kernel: float = setting(
+        3.0, "sigma", "Huber: convex, so that large true innovations cannot stick", minimum=0.1
+    )
+
+    def start_sigma_at(self, time_s: float) -> float:
+        """Return how uncertain a chain begins that is first heard of, or begun anew, at a time.
+
+        Starts are known at mission time zero; dead reckoning has run away from them since.
+        """
+        alone_s = max(time_s, 0.0)
+        drifted = (self.odometry_noise**2 + self.bias_sigma_mps**2 * alone_s) * alone_s
+        wandered = self.bias_walk**2 * alone_s**3 / 3.0
+        return float(np.sqrt(self.start_sigma_m**2 + drifted + wandered))

@@ -17,14 +17,7 @@ from firmware.dead_reckoning import DeadReckoning, ReckonedState
 from firmware.leader.answers import Answers
 from firmware.leader.atlas import LEADER, Atlas, Sheet, SheetId, name_of, sheet_of
 from firmware.leader.closure_log import ClosureLog, Verdict, verdict_of
-from firmware.leader.closures import (
-    Closure,
-    MatchJob,
-    closure_of,
-    corrections,
-    gated,
-    jobs_for,
-)
+from firmware.leader.closures import Closure, closure_of, gated
 from firmware.leader.composition import detail_from_s
 from firmware.leader.coverage import redundant
 from firmware.leader.fixes import Fixes
@@ -32,8 +25,10 @@ from firmware.leader.fleet import Fleet
 from firmware.leader.judgement import Judgement
 from firmware.leader.ledger import Anchor
 from firmware.leader.manoeuvre import Proposal, propose
+from firmware.leader.match_jobs import MatchJob, jobs_for
 from firmware.leader.matching import MatchOutcome
 from firmware.leader.observability import Observability, observe
+from firmware.leader.offsets import corrections
 from firmware.leader.open_pairs import OpenPairs
 from firmware.leader.outlook import situation_of
 from firmware.leader.own_grid import grid_of
@@ -207,9 +202,7 @@ class LeaderCore:
         self._jobs_out = True
         sheet, s = self._sheets_to_match.popleft(), self._settings
         try:
-            jobs = jobs_for(
-                sheet, self.atlas, self.graph, s.closures, s.matching, self._calibrations
-            )
+            jobs = jobs_for(sheet, self.atlas, self.graph, s.closures, self._calibrations)
         except EstimationError:
             self.counters["submaps_unplaceable"] += 1
             jobs = []

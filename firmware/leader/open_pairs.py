@@ -8,8 +8,10 @@ from collections import Counter, OrderedDict
 from dataclasses import dataclass, replace
 
 from firmware.leader.atlas import Atlas, Sheet, SheetId
-from firmware.leader.closures import ClosureSettings, MatchJob, enter_hint, jobs_again
+from firmware.leader.closure_settings import ClosureSettings
+from firmware.leader.closures import enter_hint
 from firmware.leader.judgement import Judgement
+from firmware.leader.match_jobs import MatchJob, jobs_again
 from firmware.leader.matching import MatchOutcome, NoMatch
 from firmware.leader.pairing import Calibrations
 from firmware.leader.pose_graph import PoseGraph

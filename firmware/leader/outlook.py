@@ -4,9 +4,9 @@ import numpy as np
 
 from firmware.geometry import Array
 from firmware.leader.atlas import Atlas, Sheet, name_of
-from firmware.leader.closures import corrections
 from firmware.leader.fleet import Fleet
 from firmware.leader.manoeuvre import Ground, ManoeuvreSettings, Situation, relief_information
+from firmware.leader.offsets import corrections
 from firmware.leader.pose_graph import PoseGraph
 from firmware.submaps import GriddedSubmap
 

@@ -4,7 +4,7 @@ import dataclasses
 from dataclasses import dataclass
 
 from firmware.compression.settings import BinningSettings
-from firmware.leader.closures import ClosureSettings
+from firmware.leader.closure_settings import ClosureSettings
 from firmware.leader.composition import CompositionSettings
 from firmware.leader.coverage import CoverageSettings
 from firmware.leader.fixes import FixSettings

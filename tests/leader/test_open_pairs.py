@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from firmware.leader.atlas import Atlas, Sheet, SheetId, sheet_of
-from firmware.leader.closures import ClosureSettings, MatchJob, enter_hint, jobs_again
+from firmware.leader.closure_settings import ClosureSettings
+from firmware.leader.closures import enter_hint
 from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.judgement import Judgement, JudgementSettings
+from firmware.leader.match_jobs import MatchJob, jobs_again
 from firmware.leader.matching import Hint, MatchingSettings, MatchOutcome, NoMatch
 from firmware.leader.open_pairs import OpenPairs
 from firmware.leader.pairing import Calibrations

@@ -1,0 +1,53 @@
+"""Which pairs of sub-maps are matched, and what a closure must withstand, in numbers."""
+
+from dataclasses import dataclass
+
+from protocol.settings import Settings, setting
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClosureSettings(Settings):
+    """How many pairs are tried, and what a closure must withstand."""
+
+    pairs_per_submap: int = setting(
+        12, "pairs", "bounds the work of one sub-map to a tenth of a second", minimum=1
+    )
+    known_pairs_per_submap: int = setting(
+        3, "pairs", "of those whose offset is known already; more would say it again", minimum=1
+    )
+    known_sigma_m: float = setting(
+        2.0, "m", "an offset so well known is known; a match tells it to half a metre", minimum=0.1
+    )
+    screened_per_submap: int = setting(
+        48, "sub-maps", "nearest ones whose joint covariance is asked for", minimum=1
+    )
+    second_looks: int = setting(
+        3,
+        "sub-maps",
+        "asked with each new one whether their open pairs are known better",
+        minimum=0,
+    )
+    second_look_share: float = setting(
+        0.5, "1", "of the sigma at the last look: then an open pair is looked at again", minimum=0.0
+    )
+    open_submaps: int = setting(
+        256, "sub-maps", "with open pairs; the longest not looked at go", minimum=1
+    )
+    shortest_gap_s: float = setting(
+        41.0, "s", "nearer in time, sub-maps of one vehicle share their soundings", minimum=0.0
+    )
+    expected_overlap_m2: float = setting(
+        300.0, "m^2", "mean over the prior; a match needs 480 m^2", minimum=0.0
+    )
+    hint_prior_m: float = setting(
+        8.0,
+        "m",
+        "an offset known better than so learns nothing from an ambiguous pair",
+        minimum=0.0,
+    )
+    hint_span_s: float = setting(
+        40.0, "s", "dead reckoning between the overlap and the middles of the sub-maps", minimum=0.0
+    )
+    gate_chi_square: float = setting(
+        13.8, "1", "99.9 % of true innovations of two components pass", minimum=1.0
+    )

@@ -1,0 +1,176 @@
+"""Which pairs of sub-maps are worth a match, and all that each of these matches needs."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from firmware.geometry import Array
+from firmware.leader.atlas import Atlas, Sheet, overlap_m2
+from firmware.leader.closure_settings import ClosureSettings
+from firmware.leader.estimate import Estimate
+from firmware.leader.matching import MatchingSettings, MatchOutcome, match
+from firmware.leader.offsets import Offset, correction_of, corrections, offsets_of
+from firmware.leader.pairing import Calibrations, side_of
+from firmware.submaps import GriddedSubmap
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MatchJob:
+    """Everything one match needs, so that it can run beside the loop."""
+
+    origin: Sheet
+    target: Sheet
+    origin_grid: GriddedSubmap
+    target_grid: GriddedSubmap
+    origin_drift_mps: Array
+    target_drift_mps: Array
+    prior_shift_m: Array
+    prior_covariance_m2: Array
+    settings: MatchingSettings
+
+    @property
+    def prior_sigma_m(self) -> float:
+        """How well the offset was known before the match, in its worst direction."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.prior_covariance_m2)[-1]))
+
+    def run(self) -> MatchOutcome:
+        """Match the pair."""
+        return match(
+            self.origin_grid,
+            self.target_grid,
+            self.prior_shift_m,
+            self.prior_covariance_m2,
+            self.settings,
+            reference_reconstructed=self.origin.reconstructed,
+            query_reconstructed=self.target.reconstructed,
+        )
+
+
+def jobs_for(
+    sheet: Sheet,
+    atlas: Atlas,
+    estimate: Estimate,
+    settings: ClosureSettings,
+    calibrations: Calibrations,
+) -> list[MatchJob]:
+    """Return the matches worth trying for a new sheet, most overlap first, bounded in number.
+
+    Pairs that the estimate knows well teach the calibrations first; then what the sonars do wrong
+    is taken out of all. Raises EstimationError if the sheet itself hangs on no node.
+    """
+    chosen = _worth_trying(_ranked(sheet, atlas, estimate, settings), settings)
+    return _jobs(sheet, chosen, estimate, calibrations, learn=True)
+
+
+def jobs_again(
+    sheet: Sheet,
+    partners: list[tuple[Sheet, float, int | None]],
+    estimate: Estimate,
+    settings: ClosureSettings,
+    calibrations: Calibrations,
+) -> list[MatchJob]:
+    """Return the matches of a sheet's open pairs whose offset others have told much better by now.
+
+    partners come with the sigma at the last look and the number of the hint that a look has left,
+    if any: what the pair itself told is taken out of what is known, lest it confirm itself. Raises
+    EstimationError if the sheet itself hangs on no node.
+    """
+    last_look = {other.id: (sigma_m, hint) for other, sigma_m, hint in partners}
+    shrunk = []
+    for known in offsets_of(sheet, [other for other, _, _ in partners], estimate):
+        sigma_m, hint = last_look[known.origin.id]
+        offset = known if hint is None else _without_hint(known, sheet, hint, estimate)
+        values_m2 = np.linalg.eigvalsh(offset.covariance_m2)
+        if 0.0 < values_m2[0] and values_m2[1] <= (settings.second_look_share * sigma_m) ** 2:
+            shrunk.append(offset)
+    return _jobs(sheet, shrunk[: settings.pairs_per_submap], estimate, calibrations, learn=False)
+
+
+def _without_hint(offset: Offset, sheet: Sheet, hint: int, estimate: Estimate) -> Offset:
+    other, told = offset.origin, estimate.closure(hint)
+    reckoned_m = sheet.reckoned_at(sheet.time_s) - other.reckoned_at(other.time_s)
+    return offset.without(told.offset_m - reckoned_m, told.covariance_m2)
+
+
+def _ranked(
+    sheet: Sheet, atlas: Atlas, estimate: Estimate, settings: ClosureSettings
+) -> list[Offset]:
+    """Return how a new sheet lies to those that it may overlap, most overlap first."""
+    others = [
+        other
+        for other in atlas
+        if other.id != sheet.id
+        and (
+            other.id.vehicle != sheet.id.vehicle
+            or abs(other.time_s - sheet.time_s) >= settings.shortest_gap_s
+        )
+    ]
+    if not others:
+        return []
+    centres_m = np.array([other.centre_m for other in others]) + corrections(others, estimate)
+    own_m = correction_of(sheet, estimate)
+    distances_m = np.hypot(*(centres_m - sheet.centre_m - own_m).T)
+    nearest = np.argsort(distances_m, kind="stable")[: settings.screened_per_submap]
+    ranked = []
+    for offset in offsets_of(sheet, [others[k] for k in nearest], estimate):
+        shifts_m = offset.shift_m + _spread(offset.covariance_m2)
+        area_m2 = overlap_m2(offset.origin, sheet, shifts_m).mean()
+        if area_m2 >= settings.expected_overlap_m2:
+            ranked.append((area_m2, offset))
+    ranked.sort(key=lambda item: -item[0])
+    return [offset for _, offset in ranked]
+
+
+def _worth_trying(ranked: list[Offset], settings: ClosureSettings) -> list[Offset]:
+    """Return the first of the ranked pairs, but few whose offset is known before the match."""
+    chosen, known = [], 0
+    for offset in ranked:
+        largest_m2 = np.linalg.eigvalsh(offset.covariance_m2)[-1]
+        is_known = largest_m2 <= settings.known_sigma_m**2
+        known += bool(is_known)
+        if not is_known or known <= settings.known_pairs_per_submap:
+            chosen.append(offset)
+    return chosen[: settings.pairs_per_submap]
+
+
+def _spread(covariance_m2: Array) -> Array:
+    """Return nine shifts (9, 2): none, and one and two sigmas each way along both axes."""
+    values, axes = np.linalg.eigh(covariance_m2)
+    arms_m = axes * np.sqrt(np.maximum(values, 0.0))
+    steps = np.array([[0, 0], [1, 0], [-1, 0], [2, 0], [-2, 0], [0, 1], [0, -1], [0, 2], [0, -2]])
+    return np.asarray(steps @ arms_m.T)
+
+
+def _jobs(
+    sheet: Sheet,
+    chosen: list[Offset],
+    estimate: Estimate,
+    calibrations: Calibrations,
+    *,
+    learn: bool,
+) -> list[MatchJob]:
+    """Return the matches of a sheet with those that it lies to as given."""
+    if not chosen:
+        return []
+    target = side_of(sheet, estimate.trajectory(sheet.id.chain))
+    pairs = []
+    for offset in chosen:
+        origin = side_of(offset.origin, estimate.trajectory(offset.origin.id.chain))
+        if learn:
+            calibrations.learn(origin, target, offset.shift_m, offset.covariance_m2)
+        pairs.append((origin, offset))
+    grid = calibrations.level(target)
+    return [
+        MatchJob(
+            origin=origin.sheet,
+            target=sheet,
+            origin_grid=calibrations.level(origin),
+            target_grid=grid,
+            origin_drift_mps=origin.drift_mps,
+            target_drift_mps=target.drift_mps,
+            prior_shift_m=offset.shift_m,
+            prior_covariance_m2=offset.covariance_m2,
+            settings=calibrations.matching_of(origin, target, offset.shift_m),
+        )
+        for origin, offset in pairs
+    ]

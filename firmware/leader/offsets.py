@@ -1,0 +1,85 @@
+"""Where sheets lie by the estimate, and how one lies to others before any match has told."""
+
+import contextlib
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from firmware.geometry import Array
+from firmware.leader.atlas import Sheet
+from firmware.leader.estimate import Estimate
+from firmware.leader.ledger import Anchor
+from protocol.errors import EstimationError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Offset:
+    """How a sheet lies to another one, the origin.
+
+    shift_m (2,) is to be added to what dead reckoning says, each sheet's at its own time;
+    covariance_m2 (2, 2) is that of the offset.
+    """
+
+    origin: Sheet
+    shift_m: Array
+    covariance_m2: Array
+
+    def without(self, told_m: Array, told_m2: Array) -> "Offset":
+        """Return the offset with one of the Gaussian factors that it rests on taken out."""
+        told, known = np.linalg.inv(told_m2), np.linalg.inv(self.covariance_m2)
+        left_m2 = np.linalg.inv(known - told)
+        return replace(
+            self,
+            shift_m=left_m2 @ (known @ self.shift_m - told @ told_m),
+            covariance_m2=left_m2,
+        )
+
+
+def offsets_of(sheet: Sheet, others: list[Sheet], estimate: Estimate) -> list[Offset]:
+    """Return how a sheet lies to others.
+
+    Those that hang on no node are left out: frames were lost there. Raises EstimationError if the
+    sheet itself hangs on none.
+    """
+    anchors, placed = [anchor_of(sheet, estimate)], []
+    for other in others:
+        with contextlib.suppress(EstimationError):
+            anchors.append(anchor_of(other, estimate))
+            placed.append(other)
+    joint_m2 = estimate.covariance(anchors).reshape(len(anchors), 2, len(anchors), 2)
+    own_m, found = correction_of(sheet, estimate), []
+    for k, other in enumerate(placed, start=1):
+        cross_m2 = joint_m2[0, :, k]
+        found.append(
+            Offset(
+                origin=other,
+                shift_m=own_m - correction_of(other, estimate),
+                covariance_m2=joint_m2[0, :, 0] + joint_m2[k, :, k] - cross_m2 - cross_m2.T,
+            )
+        )
+    return found
+
+
+def anchor_of(sheet: Sheet, estimate: Estimate) -> Anchor:
+    """Return where in the graph a sheet hangs.
+
+    Raises EstimationError if it hangs on no node.
+    """
+    return estimate.anchor(sheet.id.chain, sheet.time_s, sheet.track)
+
+
+def correction_of(sheet: Sheet, estimate: Estimate) -> Array:
+    """Return what is to be added (2,) to a sheet's dead reckoning at its time."""
+    trajectory = estimate.trajectory(sheet.id.chain)
+    reckoned_m = sheet.reckoned_at(sheet.time_s)
+    return trajectory.correct(sheet.time_s, reckoned_m) - reckoned_m
+
+
+def corrections(sheets: list[Sheet], estimate: Estimate) -> Array:
+    """Return what is to be added (S, 2) to each sheet's dead reckoning at its time."""
+    found_m, chains = np.zeros((len(sheets), 2)), np.array([sheet.id.chain for sheet in sheets])
+    times_s = np.array([sheet.time_s for sheet in sheets])
+    for chain in dict.fromkeys(chains.tolist()):
+        rows = np.flatnonzero(chains == chain)
+        found_m[rows] = estimate.trajectory(chain).correct(times_s[rows], np.zeros((rows.size, 2)))
+    return found_m

@@ -47,7 +47,7 @@ def sail(
 
     def watch(now_s: float) -> None:
         if now_s == survey_s:
-            outcome.proposal = leader.core.propose()
+            outcome.proposal = leader.core.outlook.propose()
             for vehicle in vehicles:
                 vehicle.steer(survey_s + CHUNK_S, _heading(outcome.proposal, vehicle, follow))
 

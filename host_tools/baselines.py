@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from firmware.dead_reckoning import DeadReckoning
 from firmware.follower.core import FollowerCore
 from firmware.follower.settings import FollowerSettings
-from firmware.leader.core import Rebuild
+from firmware.leader.arrivals import Rebuild
 from firmware.leader.own_grid import grid_of
 from firmware.leader.reconstruction import Reconstruction
 from firmware.soundings import Odometry, Ping

@@ -52,7 +52,7 @@ class LeaderRecord:
 def leader_record(leader: LeaderCore, time_s: Array, window: Window) -> LeaderRecord:
     """Return what a leader holds."""
     vehicles = leader.vehicles()
-    seen, proposal = leader.observe(leader.reckoned.time_s), leader.propose()
+    seen, proposal = leader.outlook.observe(leader.reckoned.time_s), leader.outlook.propose()
     return LeaderRecord(
         trajectories={vehicle: leader.trajectory(vehicle) for vehicle in vehicles},
         covariances_m2={v: final_covariances(v, time_s, leader) for v in vehicles},

@@ -20,7 +20,8 @@ from firmware.checkpoints import NotNowError, read, written
 from firmware.dead_reckoning import ReckonedState
 from firmware.inputs import Heard, Kind, from_state, to_instant, to_state
 from firmware.journal import Journal, StoreUnusableError
-from firmware.leader.core import LeaderCore, SheetJobs
+from firmware.leader.core import LeaderCore
+from firmware.leader.match_jobs import SheetJobs
 from firmware.leader.matches import Hint, Match, MatchOutcome, NoMatch
 from firmware.leader.settings import LeaderSettings
 from firmware.recorder import Recorder

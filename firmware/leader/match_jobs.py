@@ -46,6 +46,18 @@ class MatchJob:
         )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SheetJobs:
+    """The matches of one new sub-map, and second looks; run all, hand the outcomes to `finish`."""
+
+    sheet: Sheet
+    jobs: tuple[MatchJob, ...]
+
+    def run(self) -> list[MatchOutcome]:
+        """Run all matches, in order."""
+        return [job.run() for job in self.jobs]
+
+
 def jobs_for(
     sheet: Sheet,
     atlas: Atlas,

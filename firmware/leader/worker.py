@@ -6,7 +6,7 @@ import threading
 from dataclasses import dataclass
 from typing import Protocol
 
-from firmware.leader.core import SheetJobs
+from firmware.leader.match_jobs import SheetJobs
 from firmware.leader.matching import MatchOutcome
 
 LOG = logging.getLogger(__name__)

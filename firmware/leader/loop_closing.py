@@ -1,0 +1,114 @@
+"""From sheets to closures that the estimate uses: jobs out, outcomes in.
+
+A closure stays at hand while something may yet be decided on it; then only its verdict is kept.
+"""
+
+from collections import Counter, deque
+from collections.abc import Iterator
+
+from firmware.leader.atlas import Atlas, Sheet
+from firmware.leader.closure_log import ClosureLog, Verdict, verdict_of
+from firmware.leader.closures import Closure, closure_of, gated
+from firmware.leader.judgement import Judgement
+from firmware.leader.match_jobs import SheetJobs, jobs_for
+from firmware.leader.matching import MatchOutcome
+from firmware.leader.open_pairs import OpenPairs
+from firmware.leader.pairing import Calibrations
+from firmware.leader.pose_graph import PoseGraph
+from firmware.leader.settings import LeaderSettings
+from protocol.errors import EstimationError
+
+_SHEETS_WAITING = 16  # five minutes of own sub-maps
+
+
+class LoopClosing:
+    """Sheets that wait for their matches, and what became of those that had theirs.
+
+    What is dropped is counted with the core's counters.
+    """
+
+    def __init__(
+        self, graph: PoseGraph, atlas: Atlas, settings: LeaderSettings, counters: Counter[str]
+    ) -> None:
+        self._counters = counters
+        self.is_matching = False  # jobs are out, and their outcomes have not come yet
+        self._graph, self._atlas, self._settings = graph, atlas, settings
+        self._waiting: deque[Sheet] = deque(maxlen=_SHEETS_WAITING)
+        self._calibrations = Calibrations(settings.matching)
+        self._judgement = Judgement(settings.judgement, settings.matching, self._calibrations)
+        self._open = OpenPairs(settings.closures)
+        self._sheets_judged = 0
+        self._closures: list[Closure] = []  # on which something may yet be decided
+        self._settled = ClosureLog()
+
+    def add(self, sheet: Sheet) -> None:
+        """Let a sheet of the atlas wait for its matches; the oldest gives way."""
+        self._waiting.append(sheet)
+
+    def next_jobs(self) -> SheetJobs | None:
+        """Return the matches of the oldest sheet that still waits for them, or None."""
+        if not self._waiting:
+            return None
+        self._graph.update()
+        self.is_matching = True
+        sheet, settings = self._waiting.popleft(), self._settings.closures
+        try:
+            jobs = jobs_for(sheet, self._atlas, self._graph, settings, self._calibrations)
+        except EstimationError:
+            self._counters["submaps_unplaceable"] += 1
+            jobs = []
+        looks = self._open.second_looks(sheet, self._atlas, self._graph, self._calibrations)
+        return SheetJobs(sheet=sheet, jobs=(*jobs, *looks))
+
+    def finish(self, done: SheetJobs, outcomes: list[MatchOutcome], now_s: float) -> None:
+        """Judge what the matches of one sheet found, and bring the estimate up to it."""
+        found = []
+        for job, outcome in zip(done.jobs, outcomes, strict=True):
+            if outcome.reason is not None:
+                self._counters[f"match_{outcome.reason.name.lower()}"] += 1
+            try:
+                self._open.keep_or_settle(job, outcome, self._graph, self._judgement)
+                closure = closure_of(job, outcome, self._graph, now_s)
+            except EstimationError:
+                self._counters["closures_unplaceable"] += 1
+                continue
+            if closure is not None:
+                found.append(closure)
+        self._closures += found
+        try:
+            passed = gated(found, self._graph, self._settings.closures)
+        except EstimationError:
+            self._counters["closures_unplaceable"] += len(found)
+            passed = []
+        self._judgement.consider(passed, self._atlas, self._graph)
+        self._graph.update()
+        self.is_matching = False
+        self._sheets_judged += 1
+        if self._sheets_judged % self._settings.sheets_between_audits == 0:
+            self._judgement.audit(self._closures, self._graph)
+            self._graph.update()
+
+    def forget(self, before_s: float) -> None:
+        """Settle the closures of a past that was composed: nothing is decided on them any more."""
+        self._judgement.forget(before_s, self._graph)
+        known, self._closures = self._closures, []
+        for closure in known:
+            newest_s = max(closure.origin_anchor.time_s, closure.target_anchor.time_s)
+            if closure.number in self._graph and newest_s >= before_s:
+                self._closures.append(closure)
+            else:
+                self._settled.add(closure)
+
+    def verdicts(self) -> Iterator[Verdict]:
+        """Yield every closure that was detected, and how far it has come."""
+        yield from self._settled
+        yield from map(verdict_of, self._closures)
+
+    def status(self) -> dict[str, int]:
+        """Return the counters of judgement and open pairs."""
+        return {**self._judgement.counters, **self._open.counters}
+
+    @property
+    def open_submaps(self) -> int:
+        """How many sub-maps have open pairs."""
+        return len(self._open)

@@ -5,7 +5,7 @@ import pickle
 from collections.abc import Mapping
 from typing import Any
 
-from firmware.journal import StoreUnusableError
+from firmware.store_file import StoreUnusableError
 
 _ROOMS = ("firmware.", "protocol.")
 _OTHERS = {

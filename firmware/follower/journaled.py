@@ -7,9 +7,10 @@ from firmware.dead_reckoning import ReckonedState
 from firmware.follower.core import FollowerCore
 from firmware.follower.settings import FollowerSettings
 from firmware.inputs import Heard, Kind, from_state, to_instant, to_state
-from firmware.journal import Journal, StoreUnusableError
+from firmware.journal import Journal
 from firmware.recorder import Recorder
 from firmware.soundings import Odometry, Ping
+from firmware.store_file import StoreUnusableError
 from protocol.schedule import Slots
 
 LOG = logging.getLogger(__name__)

@@ -19,13 +19,14 @@ from firmware.belief import Belief
 from firmware.checkpoints import NotNowError, read, written
 from firmware.dead_reckoning import ReckonedState
 from firmware.inputs import Heard, Kind, from_state, to_instant, to_state
-from firmware.journal import Journal, StoreUnusableError
+from firmware.journal import Journal
 from firmware.leader.core import LeaderCore
 from firmware.leader.match_jobs import SheetJobs
 from firmware.leader.matches import Hint, Match, MatchOutcome, NoMatch
 from firmware.leader.settings import LeaderSettings
 from firmware.recorder import Recorder
 from firmware.soundings import Odometry, Ping
+from firmware.store_file import StoreUnusableError
 from protocol.schedule import Slots
 
 LOG = logging.getLogger(__name__)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from firmware.journal import Journal, JournalSettings, Owner
+from firmware.store_file import StoreFile
 from host_tools.faults.catalogue import DEADLY, Fault, Plan
 from host_tools.kills import KilledError
 
@@ -171,14 +172,25 @@ class FatedJournal(Journal):
         folder, name = self._at.parent, self._at.name
         return {p: p.read_bytes() for p in sorted(folder.glob(f"{name}*")) if "-shm" not in p.name}
 
+    def _file_at(self, path: Path) -> StoreFile:
+        return FatedFile(path, self._fate)
+
+
+class FatedFile(StoreFile):
+    """The file of such a journal: on a disk that may refuse to be written."""
+
+    def __init__(self, path: Path, fate: Fate) -> None:
+        super().__init__(path)
+        self._fate = fate
+
     def _connect(self) -> None:
         if self._fate.refuses_writes():
             raise sqlite3.OperationalError("unable to open database file")
         super()._connect()
 
     @contextmanager
-    def _transaction(self, connection: sqlite3.Connection) -> Iterator[None]:
+    def _transaction(self) -> Iterator[sqlite3.Connection]:
         if self._fate.refuses_writes():
             raise sqlite3.OperationalError("database or disk is full")
-        with super()._transaction(connection):
-            yield
+        with super()._transaction() as database:
+            yield database

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
+from firmware.boot_epochs import BOOT_EPOCHS, LIFE_S
 from firmware.clock import WallClock
 from firmware.follower.core import FollowerCore
 from firmware.follower.loop import FollowerLoop
-from firmware.journal import BOOT_EPOCHS, LIFE_S
 from firmware.leader.core import LeaderCore
 from firmware.leader.loop import LeaderLoop
 from firmware.leader.worker import InlineWorker, ThreadWorker, Worker

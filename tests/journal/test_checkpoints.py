@@ -7,7 +7,8 @@ import pytest
 
 from firmware.checkpoints import NotNowError, read, written
 from firmware.follower.journaled import JournaledFollower
-from firmware.journal import Journal, JournalSettings, Owner, StoreUnusableError
+from firmware.journal import Journal, JournalSettings, Owner
+from firmware.store_file import StoreUnusableError
 from host_tools.mission import deployed, simulated_vehicles
 from host_tools.mission_settings import MissionSettings, changed
 from host_tools.simulator.placement import place_survey
@@ -54,9 +55,9 @@ class Call:
     [
         ("os", "system"),
         ("builtins", "eval"),
-        ("firmware.journal", "os.system"),
-        ("firmware.journal", "sqlite3.connect"),
-        ("firmware.journal", "_set_aside"),
+        ("firmware.boot_epochs", "os.system"),
+        ("firmware.store_file", "sqlite3.connect"),
+        ("firmware.boot_epochs", "_write_whole"),
         ("numpy.testing", "runstring"),
         ("protocol.nowhere", "Thing"),
     ],

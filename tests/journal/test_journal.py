@@ -184,7 +184,7 @@ def test_lives_that_no_disk_counts_are_told_apart_by_the_clock(tmp_path: Path) -
 
 def full(journal: Journal, pages: int) -> None:
     """Let the disk have as many pages as the store has now, or some more."""
-    database = journal._connection
+    database = journal._file._connection
     assert database is not None
     now = database.execute("PRAGMA page_count").fetchone()[0]
     database.execute(f"PRAGMA max_page_count = {now + pages}")

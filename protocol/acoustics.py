@@ -37,6 +37,10 @@ class WaterSettings(Settings):
     bad_state_loss: float = setting(
         1.0, "share", "loss during a bad spell of Gilbert-Elliott", minimum=0.01, maximum=1.0
     )
+    silent_from_min: float = setting(
+        0.0, "min", "when the water falls silent: everything sent is lost", minimum=0.0
+    )
+    silent_min: float = setting(0.0, "min", "for how long; 0: never", minimum=0.0)
     packet_frames: int = setting(
         1,
         "frames",
@@ -211,6 +215,7 @@ class Water:
         factor = settings.outlier_factor if is_outlier else 1.0
         measured_s = now_s + factor * travel_s + noise_m / settings.sound_speed_mps
         is_lost = self._packet_is_lost(link, len(frame), self._is_lost(link))
+        is_lost |= 0.0 <= now_s / 60.0 - settings.silent_from_min < settings.silent_min
         is_corrupt = self._draw("corruption", link).random() < settings.corruption
         damaged = self._damage(link, frame)
         has_echo = self._draw("duplication", link).random() < settings.duplication

@@ -93,6 +93,14 @@ def test_loss_has_its_share() -> None:
     assert fates.count("lost") / 5000 == pytest.approx(0.14, abs=0.02)
 
 
+def test_silent_water_carries_nothing_and_changes_nothing_else() -> None:
+    silent = WaterSettings(loss=0.3, silent_from_min=10.0, silent_min=5.0)
+    fates = [d.fate for d in run(water(silent, at(0.0, 500.0)), 200)]
+    heard = [d.fate for d in run(water(WaterSettings(loss=0.3), at(0.0, 500.0)), 200)]
+    assert fates[60:90] == ["lost"] * 30
+    assert fates[:60] + fates[90:] == heard[:60] + heard[90:]
+
+
 def test_frames_of_one_packet_are_lost_together_and_answers_alone() -> None:
     medium = water(WaterSettings(loss=0.3, packet_frames=2), at(0.0, 300.0))
     fates = [delivery.fate for delivery in run(medium, 2000)]

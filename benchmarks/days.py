@@ -8,137 +8,28 @@ frames, matches, estimate and answer. Costs are of the processor, not of the clo
 """
 
 import argparse
-import multiprocessing
-import resource
+import subprocess
+import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, Listener
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
-from threadpoolctl import threadpool_limits
 
-from firmware.dead_reckoning import ReckonedState
-from firmware.follower.core import FollowerCore
-from firmware.follower.journaled import JournaledFollower
-from firmware.journal import Journal, JournalSettings, Owner
-from firmware.leader.journaled import JournaledLeader
-from firmware.ports import SensorStep
+from benchmarks.days_vehicle import Aboard, Gauge, Heard, NoLog, Order
 from host_tools.commands import add_mission_arguments, settings_of
 from host_tools.mission import deployed, run, simulated_vehicles, water_between
 from host_tools.mission_settings import MissionSettings, changed
-from host_tools.nodes import BeliefLog, FollowerNode, LeaderNode
+from host_tools.nodes import BeliefLog
 from host_tools.simulator.placement import place_survey
 from host_tools.simulator.terrain import open_terrain
 from host_tools.simulator.vehicle import SimulatedVehicle
-from protocol.schedule import Slots
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt
-
-PAGE_BYTES = resource.getpagesize()
-Heard = tuple[bytes, float | None, float]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Gauge:
-    """One vehicle at one moment; what is not a leader's is zero.
-
-    position_m is its belief (2,), or, where estimates were compared, their distances (T,).
-    """
-
-    resident_mb: float
-    position_m: np.ndarray
-    nodes: int = 0
-    records: int = 0
-    closures: int = 0
-    sheets: int = 0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Order:
-    """What a vehicle's process is told: a step of its sensors, what it heard, or to be gauged."""
-
-    now_s: float
-    step: SensorStep | None = None
-    heard: tuple[Heard, ...] = ()
-    gauge: bool = False
-    compare: bool = False
-
-
-class NoLog(BeliefLog):
-    """A mission of a day keeps no beliefs in the vehicle's process."""
-
-    def note(self, *_: object) -> None:
-        """Keep nothing."""
-
-
-def serve(
-    link: Connection, settings: MissionSettings, vehicle: int, start: ReckonedState, folder: Path
-) -> None:
-    """Be a vehicle: a process that answers orders until there are no more."""
-    journal = Journal(folder, Owner(vehicle=vehicle, fingerprint="days"), JournalSettings())
-    slots, orders = Slots(settings.slots), _Orders()
-    node: LeaderNode | FollowerNode
-    if vehicle == 0:
-        leader = JournaledLeader(journal, start, settings=settings.leader, slots=slots)
-        node = LeaderNode(leader, orders)
-    else:
-        follower = JournaledFollower(
-            journal, vehicle, start, settings=settings.follower, slots=slots
-        )
-        node = FollowerNode(follower, orders)
-    node.log = NoLog()
-    with threadpool_limits(1):
-        while (order := link.recv()) is not None:
-            if order.gauge or order.compare:
-                link.send(_gauge(node, compare=order.compare))
-                continue
-            began_s = time.process_time()
-            for heard in order.heard:
-                node.hear(*heard)
-            orders.step = order.step
-            frame = node.tick(order.now_s)
-            link.send((frame, time.process_time() - began_s))
-    journal.close()
-
-
-class _Orders(Iterator[SensorStep]):
-    """The sensors' step of the present order."""
-
-    step: SensorStep | None = None
-
-    def __next__(self) -> SensorStep:
-        if self.step is None:
-            raise StopIteration
-        return self.step
-
-
-def _gauge(node: LeaderNode | FollowerNode, *, compare: bool) -> Gauge:
-    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-    resident_mb = pages * PAGE_BYTES / 1e6
-    core = node.core
-    if isinstance(core, FollowerCore):
-        position_m = core.belief().position_m
-        return Gauge(resident_mb=resident_mb, position_m=position_m)
-    if compare:
-        before_m = np.concatenate([core.trajectory(v).position_m for v in core.vehicles()])
-        core.graph.solve_batch()
-        after_m = np.concatenate([core.trajectory(v).position_m for v in core.vehicles()])
-        position_m = np.hypot(*(after_m - before_m).T)
-    else:
-        position_m = core.belief().position_m
-    return Gauge(
-        resident_mb=resident_mb,
-        nodes=core.graph.nodes,
-        records=core.graph.records,
-        closures=sum(verdict.active for verdict in core.verdicts()),
-        sheets=len(core.atlas),
-        position_m=position_m,
-    )
 
 
 class Remote:
@@ -209,15 +100,21 @@ def mission(settings: MissionSettings, terrain: Path | None, seed: int) -> Itera
     site = place_survey(open_terrain(terrain, scenario.relief_seed), scenario, seed)
     vehicles = simulated_vehicles(settings, site, seed)
     rate_hz, duration_s = scenario.ping_hz, scenario.duration_s
-    context = multiprocessing.get_context("spawn")
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, Listener(f"{folder}/mission") as listener:
         remotes, processes = {}, []
         for vehicle in vehicles:
-            ours, theirs = context.Pipe()
-            parts = (theirs, settings, vehicle.index, deployed(vehicle), Path(folder))
-            processes.append(context.Process(target=serve, args=parts, daemon=True))
-            processes[-1].start()
-            remotes[vehicle.index] = Remote(ours, vehicle)
+            command = [sys.executable, "-m", "benchmarks.days_vehicle", str(listener.address)]
+            processes.append(subprocess.Popen(command))
+            link = listener.accept()
+            link.send(
+                Aboard(
+                    vehicle=vehicle.index,
+                    settings=settings,
+                    start=deployed(vehicle),
+                    folder=Path(folder),
+                )
+            )
+            remotes[vehicle.index] = Remote(link, vehicle)
         rows: list[Row] = []
 
         def watch(now_s: float) -> None:
@@ -249,7 +146,7 @@ def mission(settings: MissionSettings, terrain: Path | None, seed: int) -> Itera
         yield remotes[0].gauge(duration_s, compare=True)
         for remote, process in zip(remotes.values(), processes, strict=True):
             remote.close()
-            process.join()
+            process.wait()
 
 
 def draw(rows: list[Row], path: Path) -> None:

@@ -18,7 +18,7 @@ from host_tools.mapping import DepthMap
 from host_tools.registration import registration_error, tile_shifts
 from host_tools.report import write_report
 from host_tools.results import ClosureResult, MissionResult, SoundingPatch, VehicleResult
-from host_tools.scenario import named_scenario
+from host_tools.scenario import ScenarioSettings, named_scenario
 from host_tools.simulator.placement import Site, Window, place_survey
 from host_tools.simulator.terrain import open_terrain
 from host_tools.simulator.vehicle import SimulatedVehicle, TrueTrack
@@ -208,72 +208,77 @@ def test_quaternion_of_a_level_body_is_its_heading_in_enu() -> None:
     assert starboard_down[0] * starboard_down[3] == pytest.approx(np.sin(0.15) * np.cos(0.15))
 
 
+def sailed(
+    scenario: ScenarioSettings, site: Site, index: int, truth_map: DepthMap
+) -> tuple[VehicleResult, SoundingPatch]:
+    """Return what a vehicle's two minutes leave when its map is as dead reckoning began."""
+    soundings: list[np.ndarray] = []
+
+    def keep(points_m: np.ndarray) -> None:
+        truth_map.add(points_m)
+        soundings.append(points_m)
+
+    simulated = SimulatedVehicle(scenario, site.seabed, index, 1, keep)
+    reckoned, yaw = np.zeros((121, 2)), np.zeros(121)
+    at = np.array(simulated.true_position(0.0)[:2])
+    for odometry, _ in simulated.steps():
+        at += np.array([odometry.velocity_north_mps, odometry.velocity_east_mps]) / 4
+        if odometry.time_s % 1 == 0:
+            reckoned[int(odometry.time_s)], yaw[int(odometry.time_s)] = at, odometry.yaw_rad
+    truth = simulated.true_track()
+    truth_m = np.stack([truth.north_m, truth.east_m], axis=1)
+    points_m = np.concatenate(soundings)
+    off_m = (reckoned - truth_m)[0]
+    still = np.zeros(len(points_m))
+    vehicle = VehicleResult(
+        vehicle=index,
+        truth=truth,
+        dead_reckoning_m=reckoned,
+        live_m=0.5 * (reckoned + truth_m),
+        final_m=truth_m,
+        yaw_rad=yaw,
+    )
+    patch = SoundingPatch(
+        vehicle=index,
+        north_m=points_m[:, 0] + off_m[0],
+        east_m=points_m[:, 1] + off_m[1],
+        depth_m=points_m[:, 2],
+        variance_m2=still + 0.02,
+        time_s=still,
+    )
+    return vehicle, patch
+
+
+def delivery(sent_s: float, *, lost: bool = False) -> Delivery:
+    return Delivery(
+        source=1,
+        destination=0,
+        t_tx_s=sent_s,
+        t_rx_s=None if lost else sent_s + 0.1,
+        t_delivered_s=sent_s + 2.2,
+        frame=bytes(256),
+        fate="lost" if lost else "delivered",
+    )
+
+
 @pytest.fixture(scope="module")
 def mission() -> MissionResult:
     scenario = replace(named_scenario("paper-1"), {"duration_min": 2, "follower_duration_min": 1})
-    site: Site = place_survey(open_terrain(None), scenario, 1)
+    site = place_survey(open_terrain(None), scenario, 1)
     truth_map = DepthMap(site.window)
-    vehicles, patches = [], []
-    for index in range(2):
-        soundings: list[np.ndarray] = []
-
-        def keep(points_m: np.ndarray, kept: list[np.ndarray] = soundings) -> None:
-            truth_map.add(points_m)
-            kept.append(points_m)
-
-        simulated = SimulatedVehicle(scenario, site.seabed, index, 1, keep)
-        reckoned, yaw = np.zeros((121, 2)), np.zeros(121)
-        at = np.array(simulated.true_position(0.0)[:2])
-        for odometry, _ in simulated.steps():
-            at += np.array([odometry.velocity_north_mps, odometry.velocity_east_mps]) / 4
-            if odometry.time_s % 1 == 0:
-                reckoned[int(odometry.time_s)], yaw[int(odometry.time_s)] = at, odometry.yaw_rad
-        truth = simulated.true_track()
-        truth_m = np.stack([truth.north_m, truth.east_m], axis=1)
-        points_m = np.concatenate(soundings)
-        still = np.zeros(len(points_m))
-        patches.append(
-            SoundingPatch(
-                vehicle=index,
-                north_m=points_m[:, 0] + (reckoned - truth_m)[0, 0],
-                east_m=points_m[:, 1] + (reckoned - truth_m)[0, 1],
-                depth_m=points_m[:, 2],
-                variance_m2=still + 0.02,
-                time_s=still,
-            )
-        )
-        vehicles.append(
-            VehicleResult(
-                vehicle=index,
-                truth=truth,
-                dead_reckoning_m=reckoned,
-                live_m=0.5 * (reckoned + truth_m),
-                final_m=truth_m,
-                yaw_rad=yaw,
-            )
-        )
-    deliveries = [
-        Delivery(
-            source=1,
-            destination=0,
-            t_tx_s=4.0 * k,
-            t_rx_s=None if k == 3 else 4.0 * k + 0.1,
-            t_delivered_s=4.0 * k + 2.2,
-            frame=bytes(256),
-            fate="lost" if k == 3 else "delivered",
-        )
-        for k in range(10)
-    ]
+    vehicles, patches = zip(
+        *(sailed(scenario, site, index, truth_map) for index in range(2)), strict=True
+    )
     return MissionResult(
         scenario=scenario,
         site=site,
         seed=1,
         profile="paper",
         baseline="none",
-        vehicles=vehicles,
+        vehicles=list(vehicles),
         closures=[closure(), closure(stage="consistent", axis_deg=12.5)],
-        deliveries=deliveries,
-        patches=patches,
+        deliveries=[delivery(4.0 * k, lost=k == 3) for k in range(10)],
+        patches=list(patches),
         truth_map=truth_map,
         counters={"leader": {"pings": 481}},
         remarks=["rotation about the range is unobservable"],

@@ -37,6 +37,7 @@ from benchmarks.compression_windows import Window, windows
 from firmware.compression import compress, compress_steps, packets_from
 from firmware.compression.binning import SoundingBins
 from firmware.compression.kernels import Kernel
+from firmware.compression.packing import submap_header
 from firmware.compression.settings import CompressionSettings
 from firmware.geometry import Array
 from firmware.leader.reconstruction import ReconstructionSettings, reconstruct_packets
@@ -44,20 +45,10 @@ from firmware.submaps import BinnedSoundings, GriddedSubmap
 from protocol.codec import decode as decode_frame
 from protocol.codec import encode as encode_frame
 from protocol.errors import EstimationError
-from protocol.packets import Header, Profile, SubmapFragment, SubmapPacket
+from protocol.packets import SubmapFragment, SubmapPacket
 
 LOSSES = (0.0, 0.1, 0.14, 0.2)
 DRAWS = 8
-HEADER = Header(
-    profile=Profile.SUBMAP_PAPER,
-    vehicle=1,
-    boot_epoch=0,
-    submap=0,
-    fragment=0,
-    fragment_count=10,
-    tx_second=0,
-    time_quarters=0,
-)
 OURS: dict[str, tuple[str, CompressionSettings]] = {
     "paper": ("paper", CompressionSettings()),
     "paper without parity": ("paper", CompressionSettings(parity=False)),
@@ -112,7 +103,7 @@ def ours(profile: str, settings: CompressionSettings) -> Callable[[Window], Code
     def code(window: Window) -> Coded:
         def work() -> tuple[Decode, int]:
             compressed = compress(window.bins, settings, profile)
-            packets = packets_from(compressed, window.track, HEADER)
+            packets = packets_from(compressed, window.track, submap_header())
             frames = [encode_frame(packet) for packet in packets]
 
             def decode(lost: set[int]) -> Array:
@@ -246,7 +237,7 @@ def honesty(chosen: list[Window]) -> dict[str, dict[str, float]]:
             bins = _binned(window, ~held)
             longest_ms.append(_longest_step_ms(bins, profile))
             compressed = compress(bins, None, profile)
-            packets = packets_from(compressed, window.track, HEADER)
+            packets = packets_from(compressed, window.track, submap_header())
             frames = [encode_frame(packet) for packet in packets]
             arrived = received(frames, set())
             started_s = time.process_time()

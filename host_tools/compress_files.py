@@ -7,6 +7,7 @@ import numpy as np
 
 from firmware.compression import compress, packets_from
 from firmware.compression.binning import SoundingBins
+from firmware.compression.packing import submap_header
 from firmware.compression.settings import BinningSettings, CompressionSettings
 from firmware.geometry import Array
 from firmware.leader.reconstruction import ReconstructionSettings, reconstruct_packets
@@ -14,7 +15,7 @@ from firmware.submaps import Track
 from host_tools.commands import CHOICES, Command
 from protocol.codec import decode, encode
 from protocol.errors import ConfigError, EstimationError, ProtocolError, RemoteProtocolError
-from protocol.packets import FARTHEST_M, SIZE_BYTES, Header, Profile, SubmapFragment, SubmapPacket
+from protocol.packets import FARTHEST_M, SIZE_BYTES, Profile, SubmapFragment, SubmapPacket
 from protocol.settings import replace
 
 _SOUNDINGS = ("north_m", "east_m", "depth_m", "time_s")
@@ -44,19 +45,10 @@ def compress_file(
     settings = _with_frames(settings, profile, frames, small)
     bins = SoundingBins(BinningSettings())
     bins.add(np.column_stack(columns[:3]), columns[3])
-    header = Header(
-        profile=Profile.SUBMAP_PAPER,
-        vehicle=1,
-        boot_epoch=0,
-        submap=0,
-        fragment=0,
-        fragment_count=10,
-        tx_second=0,
-        time_quarters=round(4.0 * float(track.time_s[0])) % (1 << 20),
-    )
+    quarters = round(4.0 * float(track.time_s[0])) % (1 << 20)
     try:
         compressed = compress(bins.result(), settings, profile)
-        packets = packets_from(compressed, track, header)
+        packets = packets_from(compressed, track, submap_header(time_quarters=quarters))
         data = b"".join(encode(packet) for packet in packets)
     except (EstimationError, ProtocolError) as error:
         raise ConfigError(f"{soundings} makes no {profile} sub-map: {error}") from error

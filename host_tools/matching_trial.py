@@ -13,6 +13,7 @@ import numpy as np
 
 from firmware.compression import compress, packets_from
 from firmware.compression.binning import SoundingBins
+from firmware.compression.packing import submap_header
 from firmware.compression.settings import BinningSettings, CompressionSettings
 from firmware.geometry import Array
 from firmware.leader.matching import MatchingSettings, match
@@ -25,7 +26,7 @@ from host_tools.scenario import ScenarioSettings
 from host_tools.simulator.multibeam import Multibeam, Poses
 from host_tools.simulator.placement import Site
 from protocol.errors import EstimationError
-from protocol.packets import Header, Profile, SubmapFragment, SubmapPacket
+from protocol.packets import SubmapFragment, SubmapPacket
 from protocol.settings import replace
 
 SUBMAP_S = 40.0
@@ -122,7 +123,9 @@ def run_trial(
     counts: dict[tuple[str, float], list[int]] = {}
     leaves = []
     for number, pair in enumerate(_pairs(scenario, site, rng, pairs)):
-        packets = packets_from(compress(pair.first, CompressionSettings()), pair.track, _header())
+        packets = packets_from(
+            compress(pair.first, CompressionSettings()), pair.track, submap_header()
+        )
         chunks = octree_submap(pair.first)
         leaves.append(leaf_count(chunks))
         for loss in losses:
@@ -249,16 +252,3 @@ def _match_error(pair: _Pair, grid: GriddedSubmap, settings: MatchingSettings) -
         axis_rad = math.radians(outcome.match.axis_deg)
         return float(abs(error_m @ [math.cos(axis_rad), math.sin(axis_rad)]))
     return float(np.hypot(*error_m))
-
-
-def _header() -> Header:
-    return Header(
-        profile=Profile.SUBMAP_PAPER,
-        vehicle=1,
-        boot_epoch=0,
-        submap=0,
-        fragment=0,
-        fragment_count=10,
-        tx_second=0,
-        time_quarters=0,
-    )

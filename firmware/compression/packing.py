@@ -7,7 +7,12 @@ from numpy.typing import NDArray
 
 from firmware.compression.dense import DenseCode, dense_bodies
 from firmware.compression.lattice import lattice_bodies
-from firmware.compression.results import CompressedCode, CompressedPoints, fragment_points
+from firmware.compression.results import (
+    PAPER_FRAGMENTS,
+    CompressedCode,
+    CompressedPoints,
+    fragment_points,
+)
 from firmware.compression.settings import CompressionSettings
 from firmware.compression.track_code import encode_track
 from firmware.submaps import Track
@@ -20,6 +25,22 @@ from protocol.packets import (
     SubmapPacket,
 )
 from protocol.timestamps import QUARTERS_MODULO
+
+
+def submap_header(
+    *, vehicle: int = 1, boot_epoch: int = 0, submap: int = 0, time_quarters: int = 0
+) -> Header:
+    """Return a header for `packets_from`; by default that of a sub-map that stands alone."""
+    return Header(
+        profile=Profile.SUBMAP_PAPER,
+        vehicle=vehicle,
+        boot_epoch=boot_epoch,
+        submap=submap,
+        fragment=0,
+        fragment_count=PAPER_FRAGMENTS,
+        tx_second=0,
+        time_quarters=time_quarters,
+    )
 
 
 def packets_from(

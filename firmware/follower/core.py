@@ -9,6 +9,7 @@ import numpy as np
 
 from firmware.belief import Belief
 from firmware.compression import Compressed, compress_steps, packets_from
+from firmware.compression.packing import submap_header
 from firmware.compression.results import PAPER_FRAGMENTS
 from firmware.compression.settings import CompressionSettings
 from firmware.dead_reckoning import DeadReckoning, ReckonedState
@@ -26,7 +27,7 @@ from protocol.errors import (
     LocalProtocolError,
     RemoteProtocolError,
 )
-from protocol.packets import Answer, ExtendedAnswer, Header, Profile, SealedFrame
+from protocol.packets import Answer, ExtendedAnswer, SealedFrame
 from protocol.schedule import Slots
 from protocol.timestamps import from_quarters, to_quarters, transmission_s
 
@@ -197,14 +198,10 @@ class FollowerCore:
             return
         self.counters["failed_factorisations"] += fit.best.report.failed_factorisations
         self.counters["fits_stopped_early"] += not fit.best.report.settled
-        header = Header(
-            profile=Profile.SUBMAP_PAPER,
+        header = submap_header(
             vehicle=self.vehicle,
             boot_epoch=self.boot_epoch,
             submap=fit.submap.index,
-            fragment=0,
-            fragment_count=10,
-            tx_second=0,
             time_quarters=to_quarters(float(fit.submap.track.time_s[0])),
         )
         try:

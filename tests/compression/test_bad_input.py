@@ -12,6 +12,7 @@ from firmware.compression.binning import SoundingBins
 from firmware.compression.decoder import factorised
 from firmware.compression.dense import DenseCode, dense_bodies
 from firmware.compression.lattice import lattice_bodies
+from firmware.compression.packing import submap_header
 from firmware.compression.settings import CompressionSettings
 from firmware.compression.track_code import encode_track
 from firmware.geometry import Array
@@ -19,22 +20,13 @@ from firmware.leader.reconstruction import ReconstructionSettings, reconstruct_p
 from firmware.submaps import BinnedSoundings
 from protocol.codec import decode, encode
 from protocol.errors import EstimationError, LocalProtocolError
-from protocol.packets import Header, Profile, SubmapFragment, SubmapPacket
+from protocol.packets import SubmapFragment, SubmapPacket
 from tests.compression.conftest import Survey, relief_m
 
 PROFILES = ("paper", "dense", "lattice")
 QUICK = CompressionSettings(iterations=6, dense_iterations=4)
 BOUNDS = ReconstructionSettings(cell_m=1.0, max_cells=200_000)
-HEADER = Header(
-    profile=Profile.SUBMAP_PAPER,
-    vehicle=1,
-    boot_epoch=0,
-    submap=0,
-    fragment=0,
-    fragment_count=10,
-    tx_second=0,
-    time_quarters=0,
-)
+HEADER = submap_header()
 ABSURD = (0.0, -1.0, 1e30, -1e30, 1e-30, float("nan"), float("inf"))
 
 

@@ -6,28 +6,17 @@ import numpy as np
 import pytest
 
 from firmware.compression import compress, packets_from
+from firmware.compression.packing import submap_header
 from firmware.compression.settings import CompressionSettings
 from firmware.geometry import Array
 from firmware.leader.reconstruction import ReconstructionSettings, reconstruct_packets
-from protocol.packets import Header, Profile
 from tests.compression.conftest import Survey, relief_m
-
-HEADER = Header(
-    profile=Profile.SUBMAP_PAPER,
-    vehicle=1,
-    boot_epoch=0,
-    submap=0,
-    fragment=0,
-    fragment_count=10,
-    tx_second=0,
-    time_quarters=0,
-)
 
 
 @pytest.mark.parametrize("parity", [True, False])
 def test_a_lost_pair_costs_no_more_than_any_other_two_frames(survey: Survey, parity: bool) -> None:
     settings = CompressionSettings(parity=parity, iterations=8)
-    packets = packets_from(compress(survey.bins, settings), survey.track, HEADER)
+    packets = packets_from(compress(survey.bins, settings), survey.track, submap_header())
 
     def rmse_m(lost: tuple[int, ...]) -> float:
         arrived = {p.header.fragment: p for p in packets if p.header.fragment not in lost}

@@ -12,23 +12,15 @@ from firmware.compression import (
     fragment_points,
     packets_from,
 )
+from firmware.compression.packing import submap_header
 from firmware.compression.settings import CompressionSettings
 from firmware.leader.reconstruction import ReconstructionSettings, reconstruct_packets
 from protocol.codec import decode, encode
-from protocol.packets import Header, Profile, SubmapPacket
+from protocol.packets import SubmapPacket
 from tests.compression.conftest import Survey, relief_m
 
 QUICK = CompressionSettings(iterations=8)
-HEADER = Header(
-    profile=Profile.SUBMAP_PAPER,
-    vehicle=1,
-    boot_epoch=0,
-    submap=3,
-    fragment=0,
-    fragment_count=10,
-    tx_second=0,
-    time_quarters=400,
-)
+HEADER = submap_header(submap=3, time_quarters=400)
 
 
 @pytest.fixture(scope="module")

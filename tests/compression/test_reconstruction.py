@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from firmware.compression import bitplanes, compress, packets_from
 from firmware.compression.expected import run
 from firmware.compression.mantissa import completed, fitting_steps, flagged, with_parity
+from firmware.compression.packing import submap_header
 from firmware.compression.settings import CompressionSettings
 from firmware.compression.track_code import decode_track, encode_track
 from firmware.geometry import Array
@@ -111,18 +112,8 @@ def test_a_turning_track_fits_forty_bytes_within_a_metre() -> None:
 
 @pytest.fixture(scope="module")
 def fragments(survey: Survey) -> list[SubmapFragment]:
-    header = Header(
-        profile=Profile.SUBMAP_LATTICE,
-        vehicle=1,
-        boot_epoch=0,
-        submap=0,
-        fragment=0,
-        fragment_count=10,
-        tx_second=0,
-        time_quarters=0,
-    )
     compressed = compress(survey.bins, CompressionSettings(), "lattice")
-    packets = packets_from(compressed, survey.track, header)
+    packets = packets_from(compressed, survey.track, submap_header())
     return [packet for packet in packets if isinstance(packet, SubmapFragment)]
 
 

@@ -6,28 +6,19 @@ import numpy as np
 import pytest
 
 from firmware.compression import compress, packets_from
+from firmware.compression.packing import submap_header
 from firmware.compression.settings import CompressionSettings
 from firmware.leader.reconstruction import ReconstructionSettings, reconstruct_packets
 from firmware.submaps import Track
-from protocol.packets import Header, Profile, SubmapFragment
+from protocol.packets import SubmapFragment
 from tests.compression.conftest import Survey, relief_m
 
-HEADER = Header(
-    profile=Profile.SUBMAP_LATTICE,
-    vehicle=1,
-    boot_epoch=0,
-    submap=0,
-    fragment=0,
-    fragment_count=10,
-    tx_second=0,
-    time_quarters=0,
-)
 QUICK = CompressionSettings(dense_iterations=2, dense_points=120)
 
 
 def fragments(survey: Survey, profile: str, settings: CompressionSettings) -> list[SubmapFragment]:
     compressed = compress(survey.bins, settings, profile)
-    packets = packets_from(compressed, survey.track, HEADER)
+    packets = packets_from(compressed, survey.track, submap_header())
     return [packet for packet in packets if isinstance(packet, SubmapFragment)]
 
 

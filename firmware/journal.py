@@ -3,7 +3,7 @@
 The core is a function of its inputs, so the inputs are the state. They are gathered in memory and
 committed as one row, about once a second and before anything leaves the vehicle; a row holds a
 checksum, and SQLite's write-ahead log drops a torn one whole. A checkpoint, where the core can be
-written down, replaces the rows before it.
+written down, replaces the rows before it; a thread compresses it, so that no ping waits.
 
 What is wrong with a store never stops a mission: a file that cannot be used is set aside under
 another name, and one that cannot be written is counted while the mission goes on in memory.
@@ -14,6 +14,7 @@ import sqlite3
 import zlib
 from collections import Counter, deque
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -75,6 +76,8 @@ class Journal:
         self._waiting: list[bytes] = []
         self._full: deque[tuple[int, bytes]] = deque()  # rows that the disk did not take
         self._number, self._is_resumed = 0, False
+        self._compressor = ThreadPoolExecutor(max_workers=1)
+        self._checkpoint: tuple[int, Future[bytes]] | None = None  # the last row before, and body
         self._epochs = EpochFile(folder / f"{owner.name}.epoch")
         self.boot_epoch = 0
         try:
@@ -95,6 +98,8 @@ class Journal:
 
     def commit(self) -> None:
         """Put everything appended on disk; what a full disk refuses waits, up to a cap."""
+        if self._checkpoint is not None and self._checkpoint[1].done():
+            self._write_checkpoint()
         if not self._file.is_open or not (self._waiting or self._full):
             return
         if self._waiting:
@@ -110,15 +115,14 @@ class Journal:
                 self._lose(error)
 
     def checkpoint(self, body: bytes) -> None:
-        """Commit, and let the core as written down here replace all rows so far."""
+        """Commit, and let the core as written down here replace all rows so far, at a commit soon.
+
+        An earlier one that is not yet written is waited for.
+        """
+        self._write_checkpoint()
         self.commit()
-        if not self._file.is_open or self._full:
-            return
-        try:
-            self._file.write_checkpoint(self._number, zlib.compress(body, 1))
-            self.counters["store_checkpoints"] += 1
-        except sqlite3.Error:
-            self.counters["store_commits_failed"] += 1
+        if self._file.is_open and not self._full:
+            self._checkpoint = self._number, self._compressor.submit(zlib.compress, body, 1)
 
     def checkpointed(self) -> bytes | None:
         """Return the newest checkpoint, or None."""
@@ -169,6 +173,7 @@ class Journal:
     def close(self) -> None:
         """Commit and close."""
         self.commit()
+        self._write_checkpoint()
         self._close()
 
     # inside
@@ -236,6 +241,17 @@ class Journal:
         self.counters["store_bytes"] += sum(len(body) for _, body in self._full)
         self._full.clear()
 
+    def _write_checkpoint(self) -> None:
+        """Write the checkpoint that is on its way, if one is."""
+        if self._checkpoint is None:
+            return
+        (number, compressed), self._checkpoint = self._checkpoint, None
+        try:
+            self._file.write_checkpoint(number, compressed.result())
+            self.counters["store_checkpoints"] += 1
+        except sqlite3.Error:
+            self.counters["store_commits_failed"] += 1
+
     def _lose_from_the_start(self, error: Exception) -> None:
         """Go on in memory, in an epoch by the clock: the disk does not count this life."""
         self.boot_epoch = uncounted_epoch(self._next_epoch(), self._began_s)
@@ -249,7 +265,7 @@ class Journal:
 
     def _close(self) -> None:
         self._file.close()
-        self._waiting, self._full = [], deque()
+        self._waiting, self._full, self._checkpoint = [], deque(), None
 
 
 def _split(data: bytes) -> Iterator[tuple[int, bytes]]:

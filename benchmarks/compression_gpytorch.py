@@ -14,9 +14,9 @@ import numpy as np
 from benchmarks.compression_peers import Coded, points_decoder
 from benchmarks.compression_windows import Window
 from firmware.compression.binning import coarsened
-from firmware.compression.expected import run
 from firmware.compression.initial import dealt_fragments, initial_point_steps
 from firmware.compression.kernels import Hyperparameters, Kernel
+from firmware.compression.steps import run
 from firmware.geometry import Array
 
 ITERATIONS = 100

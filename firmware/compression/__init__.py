@@ -6,7 +6,6 @@ from typing import overload
 
 from firmware.compression.choice import chosen_frames
 from firmware.compression.dense import dense_code_steps
-from firmware.compression.expected import Watched
 from firmware.compression.lattice import lattice_code_steps
 from firmware.compression.packing import filled_bytes, packets_from
 from firmware.compression.points import compress_point_steps, report_of, unfitted, usable
@@ -17,6 +16,7 @@ from firmware.compression.results import (
     fragment_points,
 )
 from firmware.compression.settings import CompressionSettings
+from firmware.compression.steps import Watched
 from firmware.compression.track_code import USUAL_TRACK_BYTES
 from firmware.submaps import BinnedSoundings
 from protocol.lattice import PROTECTION_BYTES

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from firmware.compression.binning import coarsened
 from firmware.compression.calibration import calibrated
-from firmware.compression.expected import Watched, stepping
 from firmware.compression.fit import (
     FitFrame,
     FittedPoints,
@@ -29,6 +28,7 @@ from firmware.compression.results import (
 )
 from firmware.compression.settings import CompressionSettings
 from firmware.compression.smoothing import smoothed_steps
+from firmware.compression.steps import Watched, stepping
 from firmware.geometry import Array
 from firmware.submaps import BinnedSoundings
 from protocol.errors import EstimationError

@@ -119,7 +119,7 @@ def test_every_failed_factorisation_of_a_fit_is_told(
         lower, nugget, failed = factorised(k, nugget, **options)
         return lower, nugget, failed + 1
 
-    monkeypatch.setattr("firmware.compression.expected.factorised", clumsy)
+    monkeypatch.setattr("firmware.compression.weights.factorised", clumsy)
     report = compress(binned(area()), QUICK, profile).report
     assert report.failed_factorisations >= report.evaluations > 0
 
@@ -129,7 +129,7 @@ def test_a_fit_that_cannot_begin_says_so(profile: str, monkeypatch: pytest.Monke
     def refuse(*_: object, **__: object) -> None:
         raise EstimationError("covariance of 150 points stays singular")
 
-    monkeypatch.setattr("firmware.compression.expected.factorised", refuse)
+    monkeypatch.setattr("firmware.compression.weights.factorised", refuse)
     report = compress(binned(area()), QUICK, profile).report
     assert not report.settled
     assert "singular" in report.ended

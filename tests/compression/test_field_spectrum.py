@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from firmware.compression.binning import SoundingBins
-from firmware.compression.expected import run
 from firmware.compression.field import Field, fitted_field_steps, fitted_trend, wavenumbers
 from firmware.compression.lattice_frame import lattice_frame
+from firmware.compression.steps import run
 from firmware.geometry import Array
 from tests.compression.conftest import made_survey, relief_m
 

@@ -7,11 +7,12 @@ import pytest
 from numpy.typing import NDArray
 
 from firmware.compression.decoder import point_decoder
-from firmware.compression.expected import ExpectedError, run
+from firmware.compression.expected import ExpectedError
 from firmware.compression.fitc import Fitc, FitcParameters
 from firmware.compression.initial import dealt_fragments
 from firmware.compression.kernels import Hyperparameters, Kernel
 from firmware.compression.losses import loss_patterns
+from firmware.compression.steps import run
 from tests.compression.conftest import relief_m
 
 RNG = np.random.default_rng(5)

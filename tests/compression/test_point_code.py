@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware.compression.decoder import NUGGET, factorised
-from firmware.compression.expected import run
 from firmware.compression.kernels import Kernel, correlation, squared_distance
 from firmware.compression.point_code import (
     coarse_to_fine,
@@ -15,6 +14,7 @@ from firmware.compression.point_code import (
     encode_depths,
     encode_place_steps,
 )
+from firmware.compression.steps import run
 from protocol.arithmetic import CodeEnd, Decoder, Encoder
 
 

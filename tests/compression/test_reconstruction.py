@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware.compression import bitplanes, compress, packets_from
-from firmware.compression.expected import run
 from firmware.compression.mantissa import completed, fitting_steps, flagged, with_parity
 from firmware.compression.packing import submap_header
 from firmware.compression.settings import CompressionSettings
+from firmware.compression.steps import run
 from firmware.compression.track_code import decode_track, encode_track
 from firmware.geometry import Array
 from firmware.leader.reconstruction import (

@@ -51,7 +51,7 @@ _MOST_PLACES = 65000.0  # along a side: two bytes
 _PLACES_A_SPACING = 8.0  # steps: coarser costs error, finer bits
 _DEPTHS_AN_ERROR = 4.0  # steps of depth in the map's expected error
 _PLACE_EXPONENT, _DEPTH_EXPONENT = 8, 16  # steps are 2^(code - exponent) m
-_PACK_EVERY = 12
+_PACK_EVERY = 24  # evaluations: coding costs as much as two
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

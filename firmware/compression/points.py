@@ -34,7 +34,7 @@ from firmware.submaps import BinnedSoundings
 from protocol.errors import EstimationError
 from protocol.packets import DEEPEST_M, FARTHEST_M, HIGHEST_M, Profile
 
-_PACK_EVERY = 20  # evaluations: packing costs as much as four
+_PACK_EVERY = 50  # evaluations: packing costs as much as five
 _FEWEST_CELLS = 3  # a hull needs a triangle
 
 

@@ -83,18 +83,23 @@ def factorised(k: Array, nugget: float, *, use_up: bool = False) -> tuple[Array,
     """Return the lower Cholesky factor of k + nugget I, the nugget it took, and the failures.
 
     The factor is in the order of rows, so that LAPACK takes its transpose as it is. It may take the
-    place of k, of which it leaves the upper half alone: from there k is restored after a failure.
+    place of k, of whose upper half it says nothing: from there k is restored after a failure.
     """
     room = np.asarray(k, dtype=np.float64) if use_up else np.array(k, dtype=np.float64)
     diagonal = room.diagonal().copy()
     for failed in range(_TRIES):
-        room[np.diag_indices_from(room)] = diagonal + nugget
+        np.einsum("ii->i", room)[...] = diagonal + nugget
         upper, info = lapack.dpotrf(room.T, lower=0, overwrite_a=1, clean=0)  # seen as columns
         if info == 0 and np.isfinite(upper[-1, -1]):
-            for row, column in zip(upper.T, range(1, len(k) + 1), strict=True):
-                row[column:] = 0.0
             return upper.T, nugget, failed
         below = np.tril_indices_from(room, -1)
         room[below] = room.T[below]
         nugget *= 10.0
     raise EstimationError(f"covariance of {len(k)} points stays singular at a nugget of {nugget} c")
+
+
+def mirrored(lower: Array) -> Array:
+    """Return a symmetric matrix whole, in place, of which the lower half is given."""
+    for row in range(1, len(lower)):
+        lower[:row, row] = lower[row, :row]
+    return lower

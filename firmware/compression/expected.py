@@ -12,23 +12,25 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import blas
 
-from firmware.compression.kernel_rows import Room, Rows
+from firmware.compression.decoder import mirrored
+from firmware.compression.kernel_rows import Float32, Room, Rows, change_by_points, moment_terms
 from firmware.compression.kernels import (
     Kernel,
     correlation,
     correlation_and_slope,
     squared_distance,
+    subtrahends,
 )
 from firmware.compression.losses import LossPatterns
 from firmware.compression.steps import run
-from firmware.compression.weights import LossyWeights, weights_without_losses
+from firmware.compression.weights import LossyWeights, Weights, weights_without_losses
 from firmware.geometry import Array
 
 _STEP_WORK = 10240 * 150**2  # rows x points^2 of a step: under 10 ms
 _ROOM_ROWS = 192 * 150  # rows x points held at once: they stay in the cache
 _KEPT_BYTES = 4 << 20  # of kernel rows between two passes; beyond it they are made twice
-_MANY_POINTS = 200  # whose covariance is a step of its own, and its slope another
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,84 +95,67 @@ class ExpectedError:
         """
         self.evaluations += 1
         b = float(np.exp(log_b))
-        points = point_m.astype(np.float32)
-        gram, moment = np.zeros((len(points), len(points))), np.zeros(len(points))
+        points = subtrahends(point_m.astype(np.float32))
+        gram, moment = np.zeros((len(point_m), len(point_m)), order="F"), np.zeros(len(point_m))
         for done, rows in enumerate(self._rows, 1):
             rows.measure(self._kernel, points, b)
-            gram += rows.weighted.T @ rows.weighted
+            gram = blas.dsyrk(1.0, rows.weighted.T, beta=1.0, c=gram, overwrite_c=1)  # one half
             moment += rows.weighted.T @ rows.target
             if done % self._rows_a_step == 0:
                 yield
-        if not gradient and self._lossy is None:
-            return self._value(point_m, b, gram, moment)
-        inner = yield from self._solved_steps(point_m, b, gram, moment)
-        if not gradient:
-            return inner.evaluation
         yield
-        by_position, by_log_b = inner.evaluation.by_position, inner.evaluation.by_log_b
-        stack = inner.stack.astype(np.float32)
-        low_rank = (2.0 * inner.stack * inner.probability).astype(np.float32).T
-        for done, rows in enumerate(self._rows, 1):
-            if not self._kept:
-                rows.measure(self._kernel, points, b)
-            by_point, by_scale = rows.pulled(stack, low_rank, points)
-            by_position += (b * b) * by_point
-            by_log_b -= (b * b) * by_scale
-            if done % self._rows_a_step == 0:
-                yield
-        return dataclasses.replace(inner.evaluation, by_position=by_position, by_log_b=by_log_b)
-
-    def _value(self, point_m: Array, b: float, gram: Array, moment: Array) -> Evaluation:
-        """Return the error and the depths without losses, and no gradient: less memory."""
-        k = correlation(self._kernel, squared_distance(point_m, point_m, b))
-        found = weights_without_losses(gram, moment, k, self._ridge)
+        k, slope = self._own(point_m, b, gradient)
+        if self._lossy is None:
+            found = weights_without_losses(mirrored(gram.T), moment, k, self._ridge)
+        else:
+            found = yield from self._lossy.steps(mirrored(gram.T), moment, k)
         self.failed_factorisations += found.failed_factorisations
-        return Evaluation(
+        evaluation = Evaluation(
             error_m2=self.total_m2 + found.error_m2,
             by_position=np.zeros_like(point_m),
             by_log_b=0.0,
             depth_m=k @ found.beta,
         )
-
-    def _solved_steps(
-        self, point_m: Array, b: float, gram: Array, moment: Array
-    ) -> Generator[None, None, "_Inner"]:
-        """Return the best weights, their error, and the gradient through the points' own K."""
-        if self._lossy is not None:
-            squared = squared_distance(point_m, point_m, b)
-            k, slope = correlation_and_slope(self._kernel, squared, squared)
-            if slope is k:  # which is changed below
-                slope = k.copy()
-            found = yield from self._lossy.steps(gram, moment, k)
-            by_k = np.add(found.by_k, found.by_k.T)
-            by_k *= slope
-            depth_m = k @ found.beta
-        else:
-            k = correlation(self._kernel, squared_distance(point_m, point_m, b))
-            found = weights_without_losses(gram, moment, k, self._ridge)
-            depth_m = k @ found.beta
-            if len(point_m) > _MANY_POINTS:
-                yield
-            squared = squared_distance(point_m, point_m, b, gram)  # whose room is free now
-            _, by_k = correlation_and_slope(self._kernel, squared, k, squared)
-            by_k *= (2.0 * self._ridge) * found.beta
-            by_k *= found.beta[:, None]
-        self.failed_factorisations += found.failed_factorisations
-        mass, moved = by_k.sum(axis=1), by_k @ point_m
-        by_scale = mass @ np.sum(point_m**2, axis=1) - float(np.vdot(moved, point_m))
-        evaluation = Evaluation(
-            error_m2=self.total_m2 + found.error_m2,
-            by_position=(b * b) * (moved - mass[:, None] * point_m),
-            by_log_b=-(b * b) * float(by_scale),
-            depth_m=depth_m,
+        if not gradient:
+            return evaluation
+        yield
+        moments = yield from self._moment_steps(found, points, b)
+        by_position, by_log_b = change_by_points(moments, point_m, b)
+        own = self._own_moments(found, slope, point_m)
+        by_own_position, by_own_log_b = change_by_points(own, point_m, b)
+        return dataclasses.replace(
+            evaluation,
+            by_position=by_position + by_own_position,
+            by_log_b=by_log_b + 0.5 * by_own_log_b,  # each pair pulls on both of its points
         )
-        return _Inner(evaluation=evaluation, stack=found.stack, probability=found.probability)
 
+    def _own(self, point_m: Array, b: float, with_slope: bool) -> tuple[Array, Array]:
+        """Return the points' own K (M, M), and its slope unless that would only take memory."""
+        squared = squared_distance(point_m, point_m, b)
+        if not with_slope:
+            return correlation(self._kernel, squared), np.empty((0, 0))
+        k, slope = correlation_and_slope(self._kernel, squared, np.empty_like(squared), squared)
+        return k, slope if slope is not k else k.copy()  # k gets a nugget
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Inner:
-    """What is known between the passes: weights under each pattern (M, P), and the rest."""
+    def _moment_steps(
+        self, found: Weights, points: Float32, b: float
+    ) -> Generator[None, None, Array]:
+        """Return the moments (M, 4) of the cells' pull on each point."""
+        stack = found.stack.astype(np.float32)
+        low_rank = (2.0 * found.stack * found.probability).astype(np.float32).T
+        moments = np.zeros((len(stack), 4))
+        for done, rows in enumerate(self._rows, 1):
+            if not self._kept:
+                rows.measure(self._kernel, points, b)
+            moments += rows.pull(rows.misfit(stack), low_rank)
+            if done % self._rows_a_step == 0:
+                yield
+        return moments
 
-    evaluation: Evaluation
-    stack: Array
-    probability: Array
+    def _own_moments(self, found: Weights, slope: Array, point_m: Array) -> Array:
+        """Return the moments (M, 4) of the points' pull on each other through their own K."""
+        terms = moment_terms(point_m)
+        if found.by_k.size:
+            return (slope * (found.by_k + found.by_k.T)) @ terms
+        beta = found.beta[:, None]
+        return (slope @ (self._ridge * beta * terms)) * (2.0 * beta)

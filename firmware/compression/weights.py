@@ -39,13 +39,15 @@ class Weights:
 
 
 def weights_without_losses(gram: Array, moment: Array, k: Array, ridge: float) -> Weights:
-    """Return the weights of least error when every point arrives; gram and k are used up."""
-    k[np.diag_indices_from(k)] += NUGGET
-    k *= ridge
+    """Return the weights of least error when every point arrives; gram is used up.
+
+    k gets its nugget.
+    """
+    np.einsum("ii->i", k)[...] += NUGGET
+    gram /= ridge
     gram += k
-    k /= ridge
     lower, _, failed = factorised(gram, _ROUNDING * float(np.trace(gram)), use_up=True)
-    beta = np.asarray(cho_solve((lower.T, False), moment))
+    beta = np.asarray(cho_solve((lower.T, False), moment / ridge, check_finite=False))
     return Weights(
         beta=beta,
         stack=beta[:, None],
@@ -69,7 +71,7 @@ class LossyWeights:
         The points' own K enters through Q, that is through the corrections of the weights.
         """
         lower, nugget, failed = factorised(k, NUGGET)
-        k[np.diag_indices_from(k)] += nugget
+        np.einsum("ii->i", k)[...] += nugget
         inverse = cho_solve((lower, True), np.eye(len(moment)))
         yield
         blocks = [_Block.of(group, inverse) for group in self._groups]

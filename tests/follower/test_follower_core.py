@@ -104,7 +104,7 @@ def test_a_fit_that_cannot_go_on_is_counted(monkeypatch: pytest.MonkeyPatch) -> 
     def refuse(*_: object, **__: object) -> None:
         raise EstimationError("singular")
 
-    monkeypatch.setattr("firmware.compression.expected.factorised", refuse)
+    monkeypatch.setattr("firmware.compression.weights.factorised", refuse)
     core = follower_of(PATH)
     assert sent(core, 60.0)
     assert core.status()["fits_stopped_early"] >= 1

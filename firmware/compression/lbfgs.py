@@ -13,6 +13,8 @@ T = TypeVar("T")
 _PAIRS = 30  # of past steps; more brings nothing within tens of evaluations
 _SUFFICIENT = 1e-4  # Armijo
 _SHORTENINGS = 8  # of one step, then the search has failed
+_REMEMBERED = 0.8  # of the sums that tell each variable's curvature, from step to step
+_LEAST_CURVATURE = 0.1  # of a variable, in medians: below it one step says too little
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,18 +53,18 @@ def minimise_steps(
     current = yield from objective(start)
     x, used, idle = start, 1, 0
     yield Improvement(value=current.value, payload=current.payload, evaluations=used)
-    pairs: deque[tuple[Array, Array]] = deque(maxlen=_PAIRS)
+    past = _Past()
     while used < evaluations:
-        direction = -_times_inverse_hessian(current.gradient, pairs)
+        direction = -past.times_inverse_hessian(current.gradient)
         slope = float(direction @ current.gradient)
         if slope >= 0.0:
-            pairs.clear()
+            past.pairs.clear()
             direction, slope = -current.gradient, -float(current.gradient @ current.gradient)
         reach = float(np.abs(direction).max())
         if not np.isfinite(reach) or reach == 0.0:
             return "converged"
-        step = min(1.0, (largest_move if pairs else first_move) / reach)
-        if not pairs:
+        step = min(1.0, (largest_move if past.pairs else first_move) / reach)
+        if not past.pairs:
             step = first_move / reach
         for _ in range(_SHORTENINGS):
             trial = yield from objective(x + step * direction)
@@ -75,13 +77,13 @@ def minimise_steps(
             shorter = -0.5 * slope * step / curve if np.isfinite(curve) and curve > 0 else 0.25
             step *= min(max(shorter, 0.1), 0.5)
         else:
-            if not pairs:
+            if not past.pairs:
                 return "line search"
-            pairs.clear()
+            past.pairs.clear()
             continue
         change, turn = step * direction, trial.gradient - current.gradient
         if change @ turn > 1e-12 * (turn @ turn):
-            pairs.append((change, turn))
+            past.add(change, turn)
         gained = current.value - trial.value
         idle = idle + 1 if gained < tolerance * abs(trial.value) else 0
         x, current = x + change, trial
@@ -91,17 +93,45 @@ def minimise_steps(
     return "budget"
 
 
-def _times_inverse_hessian(gradient: Array, pairs: "deque[tuple[Array, Array]]") -> Array:
-    """Return the two-loop product of the inverse Hessian estimate with the gradient."""
-    out = gradient.copy()
-    shares = []
-    for change, turn in reversed(pairs):
-        share = float(change @ out) / float(change @ turn)
-        out -= share * turn
-        shares.append(share)
-    if pairs:
-        change, turn = pairs[-1]
-        out *= float(change @ turn) / float(turn @ turn)
-    for (change, turn), share in zip(pairs, reversed(shares), strict=True):
-        out += (share - float(turn @ out) / float(change @ turn)) * change
-    return out
+class _Past:
+    """Steps and how the gradient turned in them, and the inverse Hessian that they tell of.
+
+    What they leave open is taken for diagonal: in each variable the geometric mean of its own
+    curvature, by the root mean squares of its turns and steps, and of one for all. Variables far
+    stiffer than others otherwise cost half as many steps more.
+    """
+
+    def __init__(self) -> None:
+        self.pairs: deque[tuple[Array, Array]] = deque(maxlen=_PAIRS)
+        self._squares: Array | None = None  # (2, N) recent sums of turn^2 and change^2
+
+    def add(self, change: Array, turn: Array) -> None:
+        """Remember a step along which the curvature is positive."""
+        self.pairs.append((change, turn))
+        squares = np.stack([turn**2, change**2])
+        before = 0.0 if self._squares is None else _REMEMBERED * self._squares
+        self._squares = before + squares
+
+    def times_inverse_hessian(self, gradient: Array) -> Array:
+        """Return the two-loop product with the gradient."""
+        out = gradient.copy()
+        shares = []
+        for change, turn in reversed(self.pairs):
+            share = float(change @ out) / float(change @ turn)
+            out -= share * turn
+            shares.append(share)
+        if self.pairs:
+            change, turn = self.pairs[-1]
+            diagonal = self._inverse_diagonal()
+            out *= float(change @ turn) / float(turn @ (diagonal * turn)) * diagonal
+        for (change, turn), share in zip(self.pairs, reversed(shares), strict=True):
+            out += (share - float(turn @ out) / float(change @ turn)) * change
+        return out
+
+    def _inverse_diagonal(self) -> Array:
+        """Return the inverse diagonal (N,) but for its scale."""
+        assert self._squares is not None
+        turned, changed = self._squares + np.finfo(float).tiny
+        curvature = np.sqrt(turned / changed)
+        curvature = np.maximum(curvature, _LEAST_CURVATURE * np.median(curvature))
+        return np.asarray(1.0 / np.sqrt(curvature))

@@ -16,7 +16,7 @@ from firmware.compression.settings import CompressionSettings
 from firmware.geometry import Array
 from firmware.submaps import BinnedSoundings
 
-_START_SCALES = (0.6, 1.2)  # length scales tried at first, in spacings of the points
+_START_SCALE = 0.6  # length scale at first, in spacings of the points
 _TRIAL_ROWS = 1024  # rows that choose the kernel: a third, for a third of the time
 _OUTSIDE_PRICE = 1.0  # of leaving the cells' outline by a spacing, in shares of the variance
 _SHORTEST, _LONGEST = 0.2, 30.0  # length scale in spacings: between no and full correlation
@@ -219,11 +219,17 @@ def moved_steps(
 def _choose(
     frame: FitFrame, point_m: Array, dealing: Dealing, settings: CompressionSettings
 ) -> Generator[None, None, tuple[Kernel, float]]:
-    """Return the kernel and log b of least expected error at the first points."""
-    kernels = list(Kernel) if settings.kernel == "auto" else [Kernel[settings.kernel.upper()]]
-    every = max(1, len(frame.depth_m) // _TRIAL_ROWS)
+    """Return the kernel to fit with, if need be that of least expected error, and its first log b.
+
+    The search finds its length scale soon, whatever the first.
+    """
     spacing_m = spacing_of(point_m)
-    best: tuple[float, Kernel, float] = (np.inf, kernels[0], -np.log(spacing_m))
+    kernels = list(Kernel) if settings.kernel == "auto" else [Kernel[settings.kernel.upper()]]
+    log_b = {kernel: -np.log(_START_SCALE * _UNIT_SCALE[kernel] * spacing_m) for kernel in kernels}
+    if len(kernels) == 1:
+        return kernels[0], log_b[kernels[0]]
+    every = max(1, len(frame.depth_m) // _TRIAL_ROWS)
+    error_m2: dict[Kernel, float] = {}
     for kernel in kernels:
         problem = ExpectedError(
             frame.position_m[::every],
@@ -234,11 +240,10 @@ def _choose(
             dealing.fragment,
             frame.ridge * every,
         )
-        for scale in _START_SCALES:
-            log_b = -np.log(scale * _UNIT_SCALE[kernel] * spacing_m)
-            result = yield from problem.steps(point_m, log_b, gradient=False)
-            best = min(best, (result.error_m2, kernel, log_b))
-    return best[1], best[2]
+        result = yield from problem.steps(point_m, log_b[kernel], gradient=False)
+        error_m2[kernel] = result.error_m2
+    best = min(error_m2, key=lambda kernel: error_m2[kernel])
+    return best, log_b[best]
 
 
 _UNIT_SCALE = {Kernel.SQUARED_EXPONENTIAL: 1.0, Kernel.MATERN32: 2.0, Kernel.EXPONENTIAL: 4.0}

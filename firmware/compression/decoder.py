@@ -96,10 +96,3 @@ def factorised(k: Array, nugget: float, *, use_up: bool = False) -> tuple[Array,
         room[below] = room.T[below]
         nugget *= 10.0
     raise EstimationError(f"covariance of {len(k)} points stays singular at a nugget of {nugget} c")
-
-
-def mirrored(lower: Array) -> Array:
-    """Return a symmetric matrix whole, in place, of which the lower half is given."""
-    for row in range(1, len(lower)):
-        lower[:row, row] = lower[row, :row]
-    return lower

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import blas
 
-from firmware.compression.decoder import mirrored
+from firmware.compression.initial import main_axis
 from firmware.compression.kernel_rows import Float32, Room, Rows, change_by_points, moment_terms
 from firmware.compression.kernels import (
     Kernel,
@@ -29,7 +28,8 @@ from firmware.compression.weights import LossyWeights, Weights, weights_without_
 from firmware.geometry import Array
 
 _STEP_WORK = 10240 * 150**2  # rows x points^2 of a step: under 10 ms
-_ROOM_ROWS = 192 * 150  # rows x points held at once: they stay in the cache
+_ROOM_ENTRIES = 192 * 150  # rows x points held at once: they stay in the cache
+_FEWEST_ROWS = 128  # for which it pays to add to the Gram matrix
 _KEPT_BYTES = 4 << 20  # of kernel rows between two passes; beyond it they are made twice
 
 
@@ -60,18 +60,22 @@ class ExpectedError:
         weight = weight / weight.sum()
         self.total_m2 = float(np.dot(weight, depth_m**2))
         points = len(fragment)
-        height = max(64, _ROOM_ROWS // points)
+        height = max(_FEWEST_ROWS, _ROOM_ENTRIES // points)
         self._rows_a_step = max(1, _STEP_WORK // (height * points**2))
         self._kept = keep_rows and 8 * len(depth_m) * points <= _KEPT_BYTES
-        room = Room.of(min(height, len(depth_m)), points)
+        room = Room.of(min(height, len(depth_m)) * points)
+        self._axis = main_axis(position_m)
+        along_m = position_m @ self._axis
+        order = np.argsort(along_m, kind="stable")
         self._rows = [
             Rows(
-                position_m[start : start + height],
-                depth_m[start : start + height],
-                weight[start : start + height],
+                position_m[part],
+                depth_m[part],
+                weight[part],
+                along_m[part],
                 room.with_own_rows() if self._kept else room,
             )
-            for start in range(0, len(depth_m), height)
+            for part in (order[start : start + height] for start in range(0, len(order), height))
         ]
         self._kernel = kernel
         self._lossy = LossyWeights(patterns, fragment, ridge) if patterns.lost else None
@@ -88,6 +92,9 @@ class ExpectedError:
     ) -> Generator[None, None, Evaluation]:
         """Evaluate in small steps; the generator's value is the `Evaluation`.
 
+        With the gradient, that is during a search, strips of cells count as uncorrelated with the
+        points beyond the kernel's reach. Points in the order of the cells' main axis save most.
+
         Raises
         ------
         EstimationError
@@ -96,19 +103,21 @@ class ExpectedError:
         self.evaluations += 1
         b = float(np.exp(log_b))
         points = subtrahends(point_m.astype(np.float32))
-        gram, moment = np.zeros((len(point_m), len(point_m)), order="F"), np.zeros(len(point_m))
-        for done, rows in enumerate(self._rows, 1):
-            rows.measure(self._kernel, points, b)
-            gram = blas.dsyrk(1.0, rows.weighted.T, beta=1.0, c=gram, overwrite_c=1)  # one half
-            moment += rows.weighted.T @ rows.target
+        gram, moment = np.zeros((len(point_m), len(point_m))), np.zeros(len(point_m))
+        along_m, reach_m = point_m @ self._axis, self._kernel.reach / b if gradient else np.inf
+        parts = [(rows, rows.near(along_m, reach_m)) for rows in self._rows]
+        for done, (rows, near) in enumerate(parts, 1):
+            rows.measure(self._kernel, points[:, :, near], b)
+            gram[near, near] += rows.weighted.T @ rows.weighted
+            moment[near] += rows.weighted.T @ rows.target
             if done % self._rows_a_step == 0:
                 yield
         yield
         k, slope = self._own(point_m, b, gradient)
         if self._lossy is None:
-            found = weights_without_losses(mirrored(gram.T), moment, k, self._ridge)
+            found = weights_without_losses(gram, moment, k, self._ridge)
         else:
-            found = yield from self._lossy.steps(mirrored(gram.T), moment, k)
+            found = yield from self._lossy.steps(gram, moment, k)
         self.failed_factorisations += found.failed_factorisations
         evaluation = Evaluation(
             error_m2=self.total_m2 + found.error_m2,
@@ -119,7 +128,7 @@ class ExpectedError:
         if not gradient:
             return evaluation
         yield
-        moments = yield from self._moment_steps(found, points, b)
+        moments = yield from self._moment_steps(found, points, b, parts)
         by_position, by_log_b = change_by_points(moments, point_m, b)
         own = self._own_moments(found, slope, point_m)
         by_own_position, by_own_log_b = change_by_points(own, point_m, b)
@@ -138,16 +147,16 @@ class ExpectedError:
         return k, slope if slope is not k else k.copy()  # k gets a nugget
 
     def _moment_steps(
-        self, found: Weights, points: Float32, b: float
+        self, found: Weights, points: Float32, b: float, parts: list[tuple[Rows, slice]]
     ) -> Generator[None, None, Array]:
         """Return the moments (M, 4) of the cells' pull on each point."""
         stack = found.stack.astype(np.float32)
         low_rank = (2.0 * found.stack * found.probability).astype(np.float32).T
         moments = np.zeros((len(stack), 4))
-        for done, rows in enumerate(self._rows, 1):
+        for done, (rows, near) in enumerate(parts, 1):
             if not self._kept:
-                rows.measure(self._kernel, points, b)
-            moments += rows.pull(rows.misfit(stack), low_rank)
+                rows.measure(self._kernel, points[:, :, near], b)
+            moments[near] += rows.pull(rows.misfit(stack[near]), low_rank[:, near])
             if done % self._rows_a_step == 0:
                 yield
         return moments

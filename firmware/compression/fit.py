@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware.compression.expected import Evaluation, ExpectedError
-from firmware.compression.initial import Outline, dealt_fragments, initial_point_steps
+from firmware.compression.initial import Outline, dealt_fragments, initial_point_steps, main_axis
 from firmware.compression.kernels import Kernel
 from firmware.compression.lbfgs import Improvement, Trial, minimise_steps
 from firmware.compression.losses import LossPatterns, loss_patterns
@@ -16,7 +16,8 @@ from firmware.compression.settings import CompressionSettings
 from firmware.geometry import Array
 from firmware.submaps import BinnedSoundings
 
-_START_SCALE = 0.6  # length scale at first, in spacings of the points
+_FIRST_SCALE = {Kernel.SQUARED_EXPONENTIAL: 0.6, Kernel.MATERN32: 1.2, Kernel.EXPONENTIAL: 2.4}
+"""Length scale at first, in spacings of the points; the search soon finds a better one."""
 _TRIAL_ROWS = 1024  # rows that choose the kernel: a third, for a third of the time
 _OUTSIDE_PRICE = 1.0  # of leaving the cells' outline by a spacing, in shares of the variance
 _SHORTEST, _LONGEST = 0.2, 30.0  # length scale in spacings: between no and full correlation
@@ -111,12 +112,12 @@ class _Search:
         self,
         frame: FitFrame,
         start_m: Array,
-        held: int,
+        held: NDArray[np.bool_],
         dealing: Dealing,
         kernel: Kernel,
         log_b: float,
     ) -> None:
-        self._start_m, self._held, self._dealing, self._kernel = start_m, held, dealing, kernel
+        self._start_m, self._free, self._dealing, self._kernel = start_m, ~held, dealing, kernel
         self._spacing_m = spacing_of(start_m)
         self._lowest = float(np.log(1.0 / (_LONGEST * self._spacing_m)))
         self._highest = float(np.log(1.0 / (_SHORTEST * self._spacing_m)))
@@ -130,20 +131,20 @@ class _Search:
             dealing.fragment,
             frame.ridge,
         )
-        self.start = np.append(np.zeros(2 * (len(start_m) - held)), log_b)
+        self.start = np.append(np.zeros(2 * np.count_nonzero(~held)), log_b)
 
     def _unpacked(self, x: Array) -> tuple[Array, float]:
         point_m = self._start_m.copy()
-        point_m[self._held :] += self._spacing_m * x[:-1].reshape(-1, 2)
+        point_m[self._free] += self._spacing_m * x[:-1].reshape(-1, 2)
         return point_m, float(np.clip(x[-1], self._lowest, self._highest))
 
     def objective(self, x: Array) -> Generator[None, None, Trial[_State]]:
         """Evaluate the expected error, and the price of points that left the cells' outline."""
         point_m, log_b = self._unpacked(x)
         result = yield from self._problem.steps(point_m, log_b)
-        outside, by_outside = self._outline.excess(point_m[self._held :])
+        outside, by_outside = self._outline.excess(point_m[self._free])
         price = self._problem.total_m2 * _OUTSIDE_PRICE / self._spacing_m**2 / len(point_m)
-        by_position = result.by_position[self._held :] + price * by_outside
+        by_position = result.by_position[self._free] + price * by_outside
         by_x = np.append(self._spacing_m * by_position.ravel(), result.by_log_b)
         if not self._lowest < x[-1] < self._highest:
             by_x[-1] = 0.0
@@ -174,8 +175,10 @@ def fit_steps(
     iterations: int | None = None,
 ) -> Generator[FittedPoints | None, None, str]:
     """Yield ever better fits, and None between small steps; the value says why it ended."""
-    start_m, held = yield from initial_point_steps(frame.position_m, frame.depth_m, count)
+    start_m, on_rim = yield from initial_point_steps(frame.position_m, frame.depth_m, count)
     yield None
+    order = np.argsort(start_m @ main_axis(frame.position_m), kind="stable")
+    start_m, held = start_m[order], order < on_rim
     dealing = deal(start_m)
     yield None
     kernel, log_b = yield from _choose(frame, start_m, dealing, settings)
@@ -219,17 +222,14 @@ def moved_steps(
 def _choose(
     frame: FitFrame, point_m: Array, dealing: Dealing, settings: CompressionSettings
 ) -> Generator[None, None, tuple[Kernel, float]]:
-    """Return the kernel to fit with, if need be that of least expected error, and its first log b.
-
-    The search finds its length scale soon, whatever the first.
-    """
+    """Return the kernel, of several that of least expected error, and its first log b."""
     spacing_m = spacing_of(point_m)
     kernels = list(Kernel) if settings.kernel == "auto" else [Kernel[settings.kernel.upper()]]
-    log_b = {kernel: -np.log(_START_SCALE * _UNIT_SCALE[kernel] * spacing_m) for kernel in kernels}
+    log_b = {kernel: -np.log(_FIRST_SCALE[kernel] * spacing_m) for kernel in kernels}
     if len(kernels) == 1:
         return kernels[0], log_b[kernels[0]]
     every = max(1, len(frame.depth_m) // _TRIAL_ROWS)
-    error_m2: dict[Kernel, float] = {}
+    best = np.inf, kernels[0]
     for kernel in kernels:
         problem = ExpectedError(
             frame.position_m[::every],
@@ -241,12 +241,8 @@ def _choose(
             frame.ridge * every,
         )
         result = yield from problem.steps(point_m, log_b[kernel], gradient=False)
-        error_m2[kernel] = result.error_m2
-    best = min(error_m2, key=lambda kernel: error_m2[kernel])
-    return best, log_b[best]
-
-
-_UNIT_SCALE = {Kernel.SQUARED_EXPONENTIAL: 1.0, Kernel.MATERN32: 2.0, Kernel.EXPONENTIAL: 4.0}
+        best = min(best, (result.error_m2, kernel))
+    return best[1], log_b[best[1]]
 
 
 def spacing_of(point_m: Array) -> float:

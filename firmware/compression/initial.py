@@ -36,7 +36,7 @@ def rim(position_m: Array, count: int) -> Array:
     try:
         hull = ConvexHull(position_m)
     except QhullError:  # all on one line, or too few
-        along = position_m @ _main_axis(position_m)
+        along = position_m @ main_axis(position_m)
         return position_m[[int(np.argmin(along)), int(np.argmax(along))]]
     corners_m = position_m[hull.vertices]
     closed_m = np.vstack([corners_m, corners_m[:1]])
@@ -77,14 +77,15 @@ class Outline:
 
 def _extremes(position_m: Array) -> NDArray[np.intp]:
     """Return the cells farthest out in the four diagonal directions of the main axes."""
-    axis = _main_axis(position_m)
+    axis = main_axis(position_m)
     local_m = position_m @ np.array([[axis[0], -axis[1]], [axis[1], axis[0]]])
     local_m = (local_m - local_m.mean(axis=0)) / np.maximum(np.ptp(local_m, axis=0), 1e-9)
     signs = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])
     return np.asarray(np.argmax(local_m @ signs.T, axis=0), dtype=np.intp)
 
 
-def _main_axis(position_m: Array) -> Array:
+def main_axis(position_m: Array) -> Array:
+    """Return the direction (2,) along which positions (N, 2) spread most."""
     centred_m = position_m - position_m.mean(axis=0)
     axis: Array = np.linalg.eigh(centred_m.T @ centred_m)[1][:, -1]
     return axis

@@ -26,42 +26,69 @@ class Room:
     weighted: Array
 
     @classmethod
-    def of(cls, rows: int, points: int) -> "Room":
-        """Return room for so many rows."""
-        k, slope, spare = (np.empty((rows, points), dtype=np.float32) for _ in range(3))
-        return cls(k, slope, spare, np.empty((rows, points)))
+    def of(cls, entries: int) -> "Room":
+        """Return room for rows of so many entries in all."""
+        k, slope, spare = (np.empty(entries, dtype=np.float32) for _ in range(3))
+        return cls(k, slope, spare, np.empty(entries))
 
     def with_own_rows(self) -> "Room":
         """Return room that shares with this one what a pass does not leave to the next."""
         return Room(np.empty_like(self.k), np.empty_like(self.slope), self.spare, self.weighted)
 
+    def shaped(self, rows: int, points: int) -> "Room":
+        """Return its beginning in that shape."""
+        size, shape = rows * points, (rows, points)
+        return Room(
+            self.k[:size].reshape(shape),
+            self.slope[:size].reshape(shape),
+            self.spare[:size].reshape(shape),
+            self.weighted[:size].reshape(shape),
+        )
+
 
 class Rows:
-    """Some cells, and their kernel rows (R, M) times the root of their weights."""
+    """Some cells, and their kernel rows (R, M) times the root of their weights.
 
-    def __init__(self, position_m: Array, depth_m: Array, weight: Array, room: Room) -> None:
+    along_m (R,) says where the cells lie along an axis on which points may be far from them.
+    """
+
+    def __init__(
+        self, position_m: Array, depth_m: Array, weight: Array, along_m: Array, room: Room
+    ) -> None:
         root = np.sqrt(weight)
+        self._first_m, self._last_m = along_m.min(), along_m.max()
         self.target = root * depth_m
         self._minuends = minuends(position_m.astype(np.float32))
         self._root = root[:, None].astype(np.float32)
         self._target = self.target[:, None].astype(np.float32)
         self._terms = moment_terms(position_m).astype(np.float32)
-        size = len(depth_m)
-        self._k, self._slope, self._spare = room.k[:size], room.slope[:size], room.spare[:size]
-        self.weighted = room.weighted[:size]
+        self._pages = room
+        self._room = room.shaped(len(depth_m), 0)
+
+    def near(self, along_m: Array, reach_m: float) -> slice:
+        """Return the points, at along_m (M,), from the first to the last within reach."""
+        within = along_m >= self._first_m - reach_m
+        within &= along_m <= self._last_m + reach_m
+        return slice(int(np.argmax(within)), len(within) - int(np.argmax(within[::-1])))
+
+    @property
+    def weighted(self) -> Array:
+        """Return the rows in double precision; float32 sums would lose what beta lives on."""
+        return self._room.weighted
 
     def measure(self, kernel: Kernel, subtrahends: Float32, b: float) -> None:
-        """Fill the rows for these points; float32 sums would lose what beta lives on."""
-        squared = squared_differences(self._minuends, subtrahends, b, self._spare, self._slope)
-        k, slope = correlation_and_slope(kernel, squared, self._k, self._slope)
+        """Fill the rows for these points."""
+        room = self._room = self._pages.shaped(len(self._root), subtrahends.shape[2])
+        squared = squared_differences(self._minuends, subtrahends, b, room.spare, room.slope)
+        k, slope = correlation_and_slope(kernel, squared, room.k, room.slope)
         if slope is k:
-            np.copyto(self._slope, k)
+            np.copyto(room.slope, k)
         k *= self._root
-        np.copyto(self.weighted, k)
+        np.copyto(room.weighted, k)
 
     def misfit(self, stack: Float32) -> Float32:
         """Return how far the map lies from the cells under weights (M, P), weighted, (R, P)."""
-        out: Float32 = self._k @ stack
+        out: Float32 = self._room.k @ stack
         out -= self._target
         out *= self._root
         return out
@@ -72,9 +99,9 @@ class Rows:
         low_rank is (P, M): twice the points' weights times the probability of their pattern.
         """
         if len(low_rank) == 1:
-            return (self._slope.T @ (misfit * self._terms)) * low_rank.T
-        pull = np.matmul(misfit, low_rank, out=self._spare)
-        pull *= self._slope
+            return (self._room.slope.T @ (misfit * self._terms)) * low_rank.T
+        pull = np.matmul(misfit, low_rank, out=self._room.spare)
+        pull *= self._room.slope
         return pull.T @ self._terms
 
 

@@ -25,6 +25,11 @@ class Kernel(enum.IntEnum):
     MATERN32 = 1  # (1 + sqrt3 s) exp(-sqrt3 s)
     EXPONENTIAL = 2  # exp(-s / 2)
 
+    @property
+    def reach(self) -> float:
+        """Return the s at which the correlation has fallen to 1e-4, the least that counts."""
+        return (4.3, 6.8, 18.4)[self]
+
 
 def correlation(kernel: Kernel, squared: FloatArray, spare: FloatArray | None = None) -> FloatArray:
     """Return the correlation at squared scaled distances, which are used up, in their precision."""

@@ -58,6 +58,21 @@ def test_expected_error_is_the_mean_over_all_patterns_of_the_decoder_itself() ->
     assert found.error_m2 == pytest.approx(expected, rel=0.02)
 
 
+@pytest.mark.parametrize("kernel", list(Kernel))
+def test_points_beyond_the_kernels_reach_hardly_change_the_error(kernel: Kernel) -> None:
+    cells_m = RNG.uniform(0.0, 1.0, (2000, 2)) * np.array([30.0, 600.0])
+    points_m = RNG.uniform(0.0, 1.0, (200, 2)) * np.array([30.0, 600.0])
+    points_m = points_m[np.argsort(points_m[:, 1])]
+    depth_m = relief_m(*cells_m.T) - 40.0
+    none = loss_patterns(0.0, 10)
+    fragment = np.zeros(200, dtype=np.intp)
+    problem = ExpectedError(cells_m, depth_m, np.ones(2000), kernel, none, fragment, 1e-6)
+    log_b = float(np.log(kernel.reach / 60.0))
+    searched = problem.evaluate(points_m, log_b)
+    exact = run(problem.steps(points_m, log_b, gradient=False))
+    assert searched.error_m2 == pytest.approx(exact.error_m2, rel=0.01)
+
+
 def test_probabilities_of_the_patterns_sum_to_one() -> None:
     patterns = loss_patterns(0.2, 10)
     assert patterns.no_loss + patterns.probability.sum() == pytest.approx(1.0)

@@ -15,6 +15,7 @@ from collections.abc import Generator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.fft import dctn, idctn
 from scipy.ndimage import gaussian_filter
 from scipy.sparse import csc_array, csr_array
@@ -34,6 +35,8 @@ _LOCAL_DOUBT = 3.0  # coefficients, well measured, that it takes to make it do s
 _LARGEST_TURN = 1.5  # of a log spectrum in a round
 _SHY = 1.03  # on the information: a spectrum too low costs less than one too high
 _SMALLEST_M2 = 1e-9
+
+Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,7 +110,7 @@ def fitted_field_steps(
     yield
     spread_m2 = max(float(np.var(cells.depth_m)), 1e-6)
     prior = _normalised(1.0 / (1.0 + (radius * 60.0) ** 3), spread_m2)
-    coefficients = np.zeros(frame.shape)
+    coefficients = np.zeros(frame.shape, dtype=np.float32)
     for _ in range(_ROUNDS):
         coefficients = yield from cells.posterior(prior, information, coefficients, _CG_STEPS)
         told = cells.share * prior * information / (1.0 + prior * information)
@@ -118,7 +121,7 @@ def fitted_field_steps(
     return Field(
         frame=frame,
         trend=trend,
-        coefficients_m=coefficients,
+        coefficients_m=coefficients.astype(np.float64),
         spectrum_m2=prior,
         noise_m2=float(np.median(variance_m2)),
         unknown_m2=float(unknown.mean()),
@@ -157,13 +160,16 @@ def _noise_of_means(bins: BinnedSoundings) -> Array:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Cells:
-    """The cells about the trend, how the nodes give them and how well each is known."""
+    """The cells about the trend, how the nodes give them and how well each is known.
+
+    In single precision, which conjugate gradients stand where they start anew in every round.
+    """
 
     frame: LatticeFrame
     read: csr_array
     spread: csc_array  # its transpose, in the same memory
-    weight: Array
-    depth_m: Array
+    weight: Float32
+    depth_m: Float32
     share: float  # of the frame's nodes that any cell touches
 
     @classmethod
@@ -171,18 +177,19 @@ class _Cells:
         cls, bins: BinnedSoundings, frame: LatticeFrame, trend: "Trend", weight: Array
     ) -> "_Cells":
         position_m = np.column_stack([bins.north_m, bins.east_m])
-        read = interpolation(frame, position_m)
+        read = interpolation(frame, position_m).astype(np.float32)
+        depth_m = bins.depth_m - trend.depth_m(frame.nodes_of(position_m), frame)
         covered = np.count_nonzero(np.bincount(read.indices))
         return cls(
             frame=frame,
             read=read,
             spread=read.T,
-            weight=weight,
-            depth_m=bins.depth_m - trend.depth_m(frame.nodes_of(position_m), frame),
+            weight=weight.astype(np.float32),
+            depth_m=depth_m.astype(np.float32),
             share=min(covered / (frame.rows * frame.columns), 1.0),
         )
 
-    def _gathered(self, values: Array) -> Array:
+    def _gathered(self, values: Float32) -> Float32:
         nodes = self.spread @ values
         return np.asarray(dctn(nodes.reshape(self.frame.shape), norm="ortho"))
 
@@ -196,19 +203,21 @@ class _Cells:
         root = np.sqrt(self.weight)
         total = np.zeros(self.frame.shape)
         for _ in range(_PROBES):
-            total += self._gathered(root * rng.standard_normal(root.size)) ** 2
+            probe = rng.standard_normal(root.size).astype(np.float32)
+            total += self._gathered(root * probe) ** 2
         smooth = gaussian_filter(total / _PROBES, _PROBE_SIGMA, mode="reflect")
         return np.asarray(np.maximum(_SHY * smooth / self.share, 1e-12))
 
     def posterior(
-        self, prior: Array, information: Array, start: Array, most: int
-    ) -> Generator[None, None, Array]:
+        self, prior: Array, information: Array, start: Float32, most: int
+    ) -> Generator[None, None, Float32]:
         """Find the posterior mean of the coefficients from a start in so many steps."""
-        nearly = 1.0 / (1.0 / prior + information)
+        nearly = (1.0 / (1.0 / prior + information)).astype(np.float32)
+        certainty = (1.0 / prior).astype(np.float32)
 
-        def times(x: Array) -> Array:
+        def times(x: Float32) -> Float32:
             seen = self.weight * (self.read @ idctn(x, norm="ortho").ravel())
-            return x / prior + self._gathered(seen)
+            return certainty * x + self._gathered(seen)
 
         right = self._gathered(self.weight * self.depth_m)
         x, residual = start.copy(), right - times(start)

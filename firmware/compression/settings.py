@@ -58,7 +58,7 @@ class CompressionSettings(Settings):
         4096, "rows", "bounds memory and the longest step", minimum=64, maximum=65536
     )
     iterations: int = setting(
-        80, "evaluations", "0.15 s of one core; a quarter of them come within 5 %", minimum=0
+        100, "evaluations", "0.15 s of one core; a quarter of them come within 5 %", minimum=0
     )
     dense_iterations: int = setting(
         20, "evaluations", "of `dense`, each ten times dearer than one of `paper`", minimum=0

@@ -14,7 +14,7 @@ from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.ledger import Anchor, ClosureRecord, Entry
 from firmware.leader.solver import Solver
 from firmware.leader.trajectory import Trajectory
-from firmware.leader.wander import DriftChange, changes_of
+from firmware.leader.wander import DriftChange, Wandering, changes_of
 from firmware.submaps import Track
 from protocol.errors import EstimationError
 
@@ -42,6 +42,12 @@ class Estimate:
     def nodes(self) -> int:
         """How many nodes there are."""
         return sum(len(chain.keys) for chain in self._chains.values())
+
+    @property
+    def wandering(self) -> Wandering:
+        """How dead reckoning errs, as far as it is known by now."""
+        apart = self._settings.walk_apart * self._walk
+        return Wandering(noise=self._settings.odometry_noise, walk=self._walk, apart=apart)
 
     def vehicles(self) -> list[int]:
         """Return the vehicles that have a chain."""

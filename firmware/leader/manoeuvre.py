@@ -14,6 +14,7 @@ import numpy as np
 
 from firmware.geometry import Array
 from firmware.leader.observability import STATE
+from firmware.leader.wander import Wandering
 from protocol.settings import Settings, setting
 
 
@@ -29,11 +30,6 @@ class ManoeuvreSettings(Settings):
     )
     range_sigma_m: float = setting(2.0, "m", "of a predicted range", minimum=0.1)
     closure_floor_m: float = setting(0.4, "m", "no closure tells more", minimum=0.01)
-    odometry_noise: float = setting(0.2, "m/sqrt(s)", "as in the graph", minimum=1e-4)
-    bias_walk: float = setting(
-        0.002, "m/s/sqrt(s)", "that all share; alike for all headings, it ranks none", minimum=1e-7
-    )
-    bias_walk_apart: float = setting(0.0007, "m/s/sqrt(s)", "of each one's own", minimum=1e-7)
     worth: float = setting(
         0.8, "1", "of the uncertainty that going on leaves; else nothing is proposed", minimum=0.01
     )
@@ -59,6 +55,7 @@ class Situation:
     velocities_mps: Array
     ground: tuple[Ground, ...]
     joint: Array
+    wandering: Wandering
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -114,7 +111,7 @@ def expected_m(situation: Situation, velocities_mps: Array, settings: ManoeuvreS
     """Return the root mean square sigma of all positions after the horizon, each axis."""
     vehicles, step_s = len(situation.names), settings.step_s
     covariance, positions_m = situation.joint, situation.positions_m
-    forward, noise = _dead_reckoning(vehicles, len(covariance), settings)
+    forward, noise = _dead_reckoning(vehicles, situation, step_s)
     met: set[tuple[int, int]] = set()
     for _ in range(round(settings.horizon_s / step_s)):
         positions_m = positions_m + velocities_mps * step_s
@@ -158,16 +155,17 @@ def relief_information(
 _ERR_TOGETHER = 30.0  # cells, as in the calibration
 
 
-def _dead_reckoning(vehicles: int, size: int, s: ManoeuvreSettings) -> tuple[Array, Array]:
+def _dead_reckoning(vehicles: int, situation: Situation, step_s: float) -> tuple[Array, Array]:
+    size, wandering = len(situation.joint), situation.wandering
     forward, noise = np.eye(size), np.zeros((size, size))
     biases = [slice(STATE * k + 2, STATE * k + 4) for k in range(vehicles)]
     for k, bias in enumerate(biases):
         position = slice(STATE * k, STATE * k + 2)
-        forward[position, bias] = -s.step_s * np.eye(2)
-        noise[position, position] = s.odometry_noise**2 * s.step_s * np.eye(2)
+        forward[position, bias] = -step_s * np.eye(2)
+        noise[position, position] = wandering.noise**2 * step_s * np.eye(2)
         for other in biases:
-            noise[bias, other] = s.bias_walk**2 * s.step_s * np.eye(2)
-        noise[bias, bias] += s.bias_walk_apart**2 * s.step_s * np.eye(2)
+            noise[bias, other] = wandering.walk**2 * step_s * np.eye(2)
+        noise[bias, bias] += wandering.apart**2 * step_s * np.eye(2)
     return forward, noise
 
 

@@ -105,6 +105,7 @@ def situation_of(
             for sheet, place_m in zip(sheets, places_m, strict=True)
         ),
         joint=estimate.newest_with(chains, anchors),
+        wandering=estimate.wandering,
     )
 
 

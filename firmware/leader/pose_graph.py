@@ -209,8 +209,8 @@ class PoseGraph(Estimate):
         self._enter(chain.odometry(node - 1, node, noise, self._walk))
 
     def _tie(self, chain: Chain, begin_s: float, end_s: float) -> None:
-        first, apart = next(iter(self._chains.values())), self._settings.walk_apart * self._walk
-        for tie in shared_walk(first, chain, begin_s, end_s, apart):
+        first = next(iter(self._chains.values()))
+        for tie in shared_walk(first, chain, begin_s, end_s, self.wandering.apart):
             self._enter(tie)
 
     def _join_all(self) -> None:

@@ -18,6 +18,18 @@ _TOLD = 0.99  # of the expected variance: what leaves more was told nothing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Wandering:
+    """How dead reckoning errs: noise in m/sqrt(s), and walks of its drift in m/s/sqrt(s).
+
+    `walk` is shared by all vehicles in the water, `apart` each one's own.
+    """
+
+    noise: float
+    walk: float
+    apart: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class DriftChange:
     """A change of drift over an interval: what was expected of it, and what was found.
 

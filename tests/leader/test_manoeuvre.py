@@ -14,8 +14,10 @@ from firmware.leader.manoeuvre import (
     propose,
     relief_information,
 )
+from firmware.leader.wander import Wandering
 
 SETTINGS = ManoeuvreSettings()
+WANDERING = Wandering(noise=0.2, walk=0.002, apart=0.0007)
 
 
 def lost(*ground: tuple[float, float], tells: Array | None = None) -> Situation:
@@ -28,6 +30,7 @@ def lost(*ground: tuple[float, float], tells: Array | None = None) -> Situation:
         velocities_mps=np.array([[2.0, 0.0], [2.0, 0.0]]),
         ground=tuple(Ground(position_m=np.array(g), information=told) for g in ground),
         joint=np.diag([*states, *([1.0] * 2 * len(ground))]),
+        wandering=WANDERING,
     )
 
 
@@ -79,7 +82,7 @@ def test_expected_sigma_without_measurements_is_that_of_dead_reckoning() -> None
         velocities_mps=np.ones((1, 2)),
         joint=np.diag([400.0, 400.0, 1e-4, 1e-4]),
     )
-    s, t = SETTINGS, SETTINGS.horizon_s
-    walk = (s.bias_walk**2 + s.bias_walk_apart**2) * t**3 / 3
-    expected = np.sqrt(400.0 + 1e-4 * t**2 + s.odometry_noise**2 * t + walk)
-    assert expected_m(alone, alone.velocities_mps, s) == pytest.approx(expected, rel=0.02)
+    t = SETTINGS.horizon_s
+    walk = (WANDERING.walk**2 + WANDERING.apart**2) * t**3 / 3
+    expected = np.sqrt(400.0 + 1e-4 * t**2 + WANDERING.noise**2 * t + walk)
+    assert expected_m(alone, alone.velocities_mps, SETTINGS) == pytest.approx(expected, rel=0.02)

@@ -17,6 +17,7 @@ than exponentially, so that misfit which the noise model does not know cannot cr
 overlap.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,8 +26,8 @@ from firmware.geometry import Array
 from firmware.leader.screening import ErrorSurface
 
 _LEAST_BACKGROUND = 20  # shifts; fewer say nothing about the background
-
-
+_FLUCTUATIONS = 1.5  # sigmas of a mean square by which two right shifts may differ
+_LEAST_MISFIT = 0.5  # noise is seldom less than half of what is assumed
 _LEAST_GAIN = 0.3  # f(1) of a background of 2.3; below it the surface hardly has a minimum
 
 
@@ -74,6 +75,19 @@ def background(surface: ErrorSurface, best_m: Array, away_m: float) -> float | N
     if np.count_nonzero(far) < _LEAST_BACKGROUND:
         return None
     return float(np.median(surface.residual_m2[far] / surface.noise_m2[far]))
+
+
+def tolerated_misfit(misfit: float, independent_cells: float) -> float:
+    """Return the E / noise up to which a shift counts as good as the best, whose is given.
+
+    Mean squares of so many independent cells fluctuate, by a tenth at least; neighbours in a
+    reconstruction err together, and few are independent. Where even the best fits worse than the
+    noise allows, something unmodelled with few degrees of freedom is at work (strain within a
+    sub-map), and differences of its own size mean nothing.
+    """
+    fluctuation = _FLUCTUATIONS * math.sqrt(2.0 / max(independent_cells, 1.0))
+    strained = max(misfit - 0.8, 0.0)
+    return max(misfit * (1.0 + max(fluctuation, 0.2) + strained), _LEAST_MISFIT)
 
 
 def log_evidence(

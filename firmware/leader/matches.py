@@ -27,7 +27,13 @@ class MatchingSettings(Settings):
         480.0, "m^2", "the paper's N_T = 120 points of 2 m cells", minimum=0.0
     )
     coherent_overlap_m2: float = setting(
-        4000.0, "m^2", "more overlap of like relief proves nothing new", minimum=0.0
+        1200.0,
+        "m^2",
+        "more overlap of like relief proves nothing new: a ripple fits farther on as well",
+        minimum=0.0,
+    )
+    hint_overlap_m2: float = setting(
+        4000.0, "m^2", "the same for a hint, which chooses no ripple", minimum=0.0
     )
     search_sigmas: float = setting(3.0, "", "99 % of the prior's mass", minimum=1.0)
     search_cap_m: float = setting(200.0, "m", "beyond it sub-maps do not meet", minimum=1.0)

@@ -100,7 +100,9 @@ def _search(
     candidates = _refine_best(surface, found, prior, problem, times_s)
     if not candidates:
         return _none(NoMatch.UNSETTLED)
-    scale = _tolerated(min(c.residual_m2 / c.noise_m2 for c in candidates))
+    fitting = min(candidates, key=lambda c: c.residual_m2 / c.noise_m2)
+    independent = fitting.overlap_cells / problem.correlated_cells
+    scale = ambiguity.tolerated_misfit(fitting.residual_m2 / fitting.noise_m2, independent)
     relief = replace(relief, noise_scale=scale, information_per_cell=problem.information(scale))
     evidence = _evidence(surface, relief)
     refined = [_evidence_at(candidate, relief) for candidate in candidates]
@@ -120,7 +122,12 @@ def _hint(
     misfit = surface.residual_m2 / surface.noise_m2
     is_own = not (problem.reference.reconstructed or problem.query.reconstructed)
     scale = max(1.2 * float(misfit.min()), _WARPED_NOISE if is_own else 0.5)
-    relief = replace(relief, noise_scale=scale, information_per_cell=problem.information(scale))
+    relief = replace(
+        relief,
+        noise_scale=scale,
+        information_per_cell=problem.information(scale),
+        coherent_cells=problem.settings.hint_overlap_m2 / problem.query.grid.cell_m**2,
+    )
     evidence = ambiguity.tempered_evidence(surface, relief, problem.correlated_cells)
     found = _posterior(surface, evidence, prior, problem)
     mean_m, covariance_m2 = ambiguity.moments(found, prior.mean_m, prior.covariance_m2)
@@ -140,16 +147,6 @@ def _hint(
         shift_m=prior.mean_m + frame @ away,
         covariance_m2=told_m2 + problem.settings.hint_floor_m**2 * np.eye(2),
     )
-
-
-def _tolerated(misfit: float) -> float:
-    """Return the misfit up to which a shift counts as good as the best, whose misfit is given.
-
-    Residuals fluctuate by a tenth; where even the best fits worse than the noise allows, something
-    unmodelled with few degrees of freedom is at work (strain within a sub-map), and differences of
-    its own size mean nothing.
-    """
-    return max(misfit * (1.2 + max(misfit - 0.8, 0.0)), 0.5)
 
 
 def _evidence(surface: ErrorSurface, relief: ambiguity.Relief) -> Array:

@@ -2,6 +2,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from firmware.geometry import Array
 from firmware.leader.matches import count_reasons
@@ -114,6 +115,41 @@ def test_ripples_are_ambiguous_when_the_prior_spans_several(scene: Scene) -> Non
     query = scene.submap(200, 220, (41, 70), relief=ripples)
     assert refused(reference, query, 30.0) is NoMatch.AMBIGUOUS
     assert np.abs(matched(reference, query, np.zeros(2), 2.0).shift_m).max() < 0.5
+
+
+def rebuilt(grid: GriddedSubmap, scene: Scene, sigma_m: float) -> GriddedSubmap:
+    """Return a grid as few points rebuild it: with an error whose neighbours err alike."""
+    error = ndimage.gaussian_filter(scene.rng.standard_normal(grid.depth_m.shape), 2.0)
+    error *= sigma_m / error.std()
+    variance_m2 = np.full(grid.depth_m.shape, 1.5 * sigma_m**2)
+    return dataclasses.replace(grid, depth_m=grid.depth_m + error, variance_m2=variance_m2)
+
+
+@pytest.mark.parametrize("sigma_m", [0.06, 0.09])
+def test_ripple_with_more_overlap_is_not_the_right_one_for_that(sigma_m: float) -> None:
+    misses_m = []
+    for seed in range(12):
+        scene = Scene(seed, rms_m=0.06)
+
+        def ripples(north: Array, east: Array, scene: Scene = scene) -> Array:
+            crests = 0.15 * np.sin(2.0 * np.pi * (north + 0.3 * east) / 14.0)
+            return np.asarray(scene.at(north, east) + crests)
+
+        reference = rebuilt(scene.submap(200, 200, (31, 35), relief=ripples), scene, sigma_m)
+        query = rebuilt(scene.submap(215, 215, (31, 35), relief=ripples), scene, sigma_m)
+        outcome = match(
+            reference,
+            query,
+            scene.rng.normal(0.0, 10.0, 2),
+            np.eye(2) * 15.0**2,
+            MatchingSettings(),
+            reference_reconstructed=True,
+            query_reconstructed=True,
+        )
+        if outcome.match is not None:
+            axis = np.radians(outcome.match.axis_deg or 0.0)
+            misses_m.append(abs(outcome.match.shift_m @ [np.cos(axis), np.sin(axis)]))
+    assert all(miss_m < 5.0 for miss_m in misses_m)
 
 
 def test_unrelated_seabed_gives_no_closure(scene: Scene) -> None:

@@ -74,7 +74,7 @@ class MatchingSettings(Settings):
     )
     basin_m: float = setting(5.0, "m", "further off a closure is called invalid", minimum=0.1)
     false_mass_limit: float = setting(
-        0.05, "", "posterior mass that may lie outside the winner's basin", minimum=0.0, maximum=1.0
+        0.02, "", "posterior mass that may lie outside the winner's basin", minimum=0.0, maximum=1.0
     )
     null_share: float = setting(
         0.01, "", "chance that the graph's prior is wrong altogether", minimum=0.0, maximum=1.0
@@ -83,7 +83,7 @@ class MatchingSettings(Settings):
         3.0, "", "log evidence of the relief alone, whatever the prior says", minimum=0.0
     )
     sigma_limit_m: float = setting(
-        2.5, "m", "a weaker shift could not be told from an invalid one", minimum=0.0
+        2.0, "m", "a weaker shift could not be told from an invalid one", minimum=0.0
     )
     covariance_scale: float = setting(
         1.0, "", "from simulated pairs, so that NEES is 2", minimum=0.1

@@ -63,7 +63,8 @@ class ExpectedError:
         height = max(_FEWEST_ROWS, _ROOM_ENTRIES // points)
         self._rows_a_step = max(1, _STEP_WORK // (height * points**2))
         self._kept = keep_rows and 8 * len(depth_m) * points <= _KEPT_BYTES
-        room = Room.of(min(height, len(depth_m)) * points)
+        self._height = height
+        room = self._room = Room.of(height * points)
         self._axis = main_axis(position_m)
         along_m = position_m @ self._axis
         order = np.argsort(along_m, kind="stable")
@@ -108,12 +109,13 @@ class ExpectedError:
         parts = [(rows, rows.near(along_m, reach_m)) for rows in self._rows]
         for done, (rows, near) in enumerate(parts, 1):
             rows.measure(self._kernel, points[:, :, near], b)
-            gram[near, near] += rows.weighted.T @ rows.weighted
-            moment[near] += rows.weighted.T @ rows.target
+            weighted = rows.weighted()
+            gram[near, near] += weighted.T @ weighted
+            moment[near] += weighted.T @ rows.target
             if done % self._rows_a_step == 0:
                 yield
         yield
-        k, slope = self._own(point_m, b, gradient)
+        k = correlation(self._kernel, squared_distance(point_m, point_m, b))
         if self._lossy is None:
             found = weights_without_losses(gram, moment, k, self._ridge)
         else:
@@ -127,24 +129,17 @@ class ExpectedError:
         )
         if not gradient:
             return evaluation
+        del gram, k  # the fit's largest, and used up
         yield
         moments = yield from self._moment_steps(found, points, b, parts)
         by_position, by_log_b = change_by_points(moments, point_m, b)
-        own = self._own_moments(found, slope, point_m)
+        own = self._own_moments(found, point_m, b)
         by_own_position, by_own_log_b = change_by_points(own, point_m, b)
         return dataclasses.replace(
             evaluation,
             by_position=by_position + by_own_position,
             by_log_b=by_log_b + 0.5 * by_own_log_b,  # each pair pulls on both of its points
         )
-
-    def _own(self, point_m: Array, b: float, with_slope: bool) -> tuple[Array, Array]:
-        """Return the points' own K (M, M), and its slope unless that would only take memory."""
-        squared = squared_distance(point_m, point_m, b)
-        if not with_slope:
-            return correlation(self._kernel, squared), np.empty((0, 0))
-        k, slope = correlation_and_slope(self._kernel, squared, np.empty_like(squared), squared)
-        return k, slope if slope is not k else k.copy()  # k gets a nugget
 
     def _moment_steps(
         self, found: Weights, points: Float32, b: float, parts: list[tuple[Rows, slice]]
@@ -161,10 +156,18 @@ class ExpectedError:
                 yield
         return moments
 
-    def _own_moments(self, found: Weights, slope: Array, point_m: Array) -> Array:
+    def _own_moments(self, found: Weights, point_m: Array, b: float) -> Array:
         """Return the moments (M, 4) of the points' pull on each other through their own K."""
-        terms = moment_terms(point_m)
-        if found.by_k.size:
-            return (slope * (found.by_k + found.by_k.T)) @ terms
-        beta = found.beta[:, None]
-        return (slope @ (self._ridge * beta * terms)) * (2.0 * beta)
+        local_m, terms = point_m.astype(np.float32), moment_terms(point_m)
+        moments = np.empty_like(terms)
+        for start in range(0, len(point_m), self._height):
+            part = slice(start, start + self._height)
+            room = self._room.shaped(len(point_m[part]), len(point_m))
+            squared = squared_distance(local_m[part], local_m, b, room.k, room.slope)
+            slope = correlation_and_slope(self._kernel, squared, room.k, room.slope)[1]
+            if found.by_k.size:
+                moments[part] = (slope * (found.by_k[part] + found.by_k[:, part].T)) @ terms
+            else:
+                pull = (self._ridge * found.beta[:, None] * terms).astype(np.float32)
+                moments[part] = (slope @ pull) * (2.0 * found.beta[part, None])
+        return moments

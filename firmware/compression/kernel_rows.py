@@ -22,18 +22,17 @@ class Room:
 
     k: Float32
     slope: Float32
-    spare: Float32
-    weighted: Array
+    double: Array  # k in double precision, or what has to be kept for a moment only
 
     @classmethod
     def of(cls, entries: int) -> "Room":
         """Return room for rows of so many entries in all."""
-        k, slope, spare = (np.empty(entries, dtype=np.float32) for _ in range(3))
-        return cls(k, slope, spare, np.empty(entries))
+        k, slope = (np.empty(entries, dtype=np.float32) for _ in range(2))
+        return cls(k, slope, np.empty(entries))
 
     def with_own_rows(self) -> "Room":
         """Return room that shares with this one what a pass does not leave to the next."""
-        return Room(np.empty_like(self.k), np.empty_like(self.slope), self.spare, self.weighted)
+        return Room(np.empty_like(self.k), np.empty_like(self.slope), self.double)
 
     def shaped(self, rows: int, points: int) -> "Room":
         """Return its beginning in that shape."""
@@ -41,9 +40,13 @@ class Room:
         return Room(
             self.k[:size].reshape(shape),
             self.slope[:size].reshape(shape),
-            self.spare[:size].reshape(shape),
-            self.weighted[:size].reshape(shape),
+            self.double[:size].reshape(shape),
         )
+
+    @property
+    def spare(self) -> Float32:
+        """Return room of the rows' shape in the place of what stood in double precision."""
+        return self.double.reshape(-1).view(np.float32)[: self.k.size].reshape(self.k.shape)
 
 
 class Rows:
@@ -71,20 +74,19 @@ class Rows:
         within &= along_m <= self._last_m + reach_m
         return slice(int(np.argmax(within)), len(within) - int(np.argmax(within[::-1])))
 
-    @property
     def weighted(self) -> Array:
         """Return the rows in double precision; float32 sums would lose what beta lives on."""
-        return self._room.weighted
+        np.copyto(self._room.double, self._room.k)
+        return self._room.double
 
     def measure(self, kernel: Kernel, subtrahends: Float32, b: float) -> None:
         """Fill the rows for these points."""
         room = self._room = self._pages.shaped(len(self._root), subtrahends.shape[2])
-        squared = squared_differences(self._minuends, subtrahends, b, room.spare, room.slope)
+        squared = squared_differences(self._minuends, subtrahends, b, room.k, room.slope)
         k, slope = correlation_and_slope(kernel, squared, room.k, room.slope)
         if slope is k:
             np.copyto(room.slope, k)
         k *= self._root
-        np.copyto(room.weighted, k)
 
     def misfit(self, stack: Float32) -> Float32:
         """Return how far the map lies from the cells under weights (M, P), weighted, (R, P)."""

@@ -48,6 +48,7 @@ _RARELY = 0.02  # how often fewer frames may arrive than give the points
 _BITS = 17  # a point at most takes, with few exceptions: 10 for its place, 7 for its depth
 _MOST_POINTS = 600
 _MOST_PLACES = 65000.0  # along a side: two bytes
+_PLACING_CELL = 1.25  # times the cells that give depths, of those that place: half a spacing
 _PLACES_A_SPACING = 8.0  # steps: coarser costs error, finer bits
 _DEPTHS_AN_ERROR = 4.0  # steps of depth in the map's expected error
 _PLACE_EXPONENT, _DEPTH_EXPONENT = 8, 16  # steps are 2^(code - exponent) m
@@ -84,12 +85,14 @@ def dense_code_steps(
     fitting = 8 * (room - _HEAD.size) // _BITS
     count = max(3, min(settings.dense_points, fitting, cells.depth_m.size))
     frame = fit_frame(cells, settings.max_fit_rows)
+    coarse = coarsened(targets, _PLACING_CELL * settings.fit_cell_m)
+    placing = fit_frame(coarse, settings.max_fit_rows, frame)
 
     def deal(position_m: Array) -> Dealing:
         fragment = np.zeros(len(position_m), dtype=np.intp)
         return Dealing(fragment=fragment, patterns=loss_patterns(0.0, settings.frames))
 
-    steps = fit_steps(frame, count, settings, deal, settings.dense_iterations)
+    steps = fit_steps(placing, count, settings, deal, settings.dense_iterations)
     waiting: FittedPoints | None = None
     packed_at = 0
     while True:

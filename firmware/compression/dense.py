@@ -49,6 +49,7 @@ _BITS = 17  # a point at most takes, with few exceptions: 10 for its place, 7 fo
 _MOST_POINTS = 600
 _MOST_PLACES = 65000.0  # along a side: two bytes
 _PLACING_CELL = 1.25  # times the cells that give depths, of those that place: half a spacing
+_REACH_SHARE = 0.75  # of the kernel's: twenty evaluations do not find what more would tell
 _PLACES_A_SPACING = 8.0  # steps: coarser costs error, finer bits
 _DEPTHS_AN_ERROR = 4.0  # steps of depth in the map's expected error
 _PLACE_EXPONENT, _DEPTH_EXPONENT = 8, 16  # steps are 2^(code - exponent) m
@@ -92,7 +93,7 @@ def dense_code_steps(
         fragment = np.zeros(len(position_m), dtype=np.intp)
         return Dealing(fragment=fragment, patterns=loss_patterns(0.0, settings.frames))
 
-    steps = fit_steps(placing, count, settings, deal, settings.dense_iterations)
+    steps = fit_steps(placing, count, settings, deal, settings.dense_iterations, _REACH_SHARE)
     waiting: FittedPoints | None = None
     packed_at = 0
     while True:

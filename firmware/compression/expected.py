@@ -56,6 +56,7 @@ class ExpectedError:
         fragment: NDArray[np.intp],
         ridge: float,
         keep_rows: bool = True,
+        reach_share: float = 1.0,
     ) -> None:
         weight = weight / weight.sum()
         self.total_m2 = float(np.dot(weight, depth_m**2))
@@ -78,7 +79,7 @@ class ExpectedError:
             )
             for part in (order[start : start + height] for start in range(0, len(order), height))
         ]
-        self._kernel = kernel
+        self._kernel, self._reach = kernel, reach_share * kernel.reach
         self._lossy = LossyWeights(patterns, fragment, ridge) if patterns.lost else None
         self._ridge = ridge
         self.failed_factorisations = 0
@@ -93,8 +94,8 @@ class ExpectedError:
     ) -> Generator[None, None, Evaluation]:
         """Evaluate in small steps; the generator's value is the `Evaluation`.
 
-        With the gradient, that is during a search, strips of cells count as uncorrelated with the
-        points beyond the kernel's reach. Points in the order of the cells' main axis save most.
+        Strips of cells count as uncorrelated with the points beyond the kernel's reach. Points in
+        the order of the cells' main axis save most.
 
         Raises
         ------
@@ -105,7 +106,7 @@ class ExpectedError:
         b = float(np.exp(log_b))
         points = subtrahends(point_m.astype(np.float32))
         gram, moment = np.zeros((len(point_m), len(point_m))), np.zeros(len(point_m))
-        along_m, reach_m = point_m @ self._axis, self._kernel.reach / b if gradient else np.inf
+        along_m, reach_m = point_m @ self._axis, self._reach / b
         parts = [(rows, rows.near(along_m, reach_m)) for rows in self._rows]
         for done, (rows, near) in enumerate(parts, 1):
             rows.measure(self._kernel, points[:, :, near], b)

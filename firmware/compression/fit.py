@@ -116,6 +116,7 @@ class _Search:
         dealing: Dealing,
         kernel: Kernel,
         log_b: float,
+        reach_share: float,
     ) -> None:
         self._start_m, self._free, self._dealing, self._kernel = start_m, ~held, dealing, kernel
         self._spacing_m = spacing_of(start_m)
@@ -130,6 +131,7 @@ class _Search:
             dealing.patterns,
             dealing.fragment,
             frame.ridge,
+            reach_share=reach_share,
         )
         self.start = np.append(np.zeros(2 * np.count_nonzero(~held)), log_b)
 
@@ -173,8 +175,13 @@ def fit_steps(
     settings: CompressionSettings,
     deal: Dealer,
     iterations: int | None = None,
+    reach_share: float = 1.0,
 ) -> Generator[FittedPoints | None, None, str]:
-    """Yield ever better fits, and None between small steps; the value says why it ended."""
+    """Yield ever better fits, and None between small steps; the value says why it ended.
+
+    The search may look at a share of the kernel's reach only: the shorter, the sooner an
+    evaluation is done and the sooner more of them bring nothing.
+    """
     start_m, on_rim = yield from initial_point_steps(frame.position_m, frame.depth_m, count)
     yield None
     order = np.argsort(start_m @ main_axis(frame.position_m), kind="stable")
@@ -182,7 +189,7 @@ def fit_steps(
     dealing = deal(start_m)
     yield None
     kernel, log_b = yield from _choose(frame, start_m, dealing, settings)
-    search = _Search(frame, start_m, held, dealing, kernel, log_b)
+    search = _Search(frame, start_m, held, dealing, kernel, log_b, reach_share)
     steps = minimise_steps(
         search.objective,
         search.start,

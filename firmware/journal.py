@@ -76,7 +76,7 @@ class Journal:
         self._waiting: list[bytes] = []
         self._full: deque[tuple[int, bytes]] = deque()  # rows that the disk did not take
         self._number, self._is_resumed = 0, False
-        self._compressor = ThreadPoolExecutor(max_workers=1)
+        self._compressor = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
         self._checkpoint: tuple[int, Future[bytes]] | None = None  # the last row before, and body
         self._epochs = EpochFile(folder / f"{owner.name}.epoch")
         self.boot_epoch = 0
@@ -121,8 +121,12 @@ class Journal:
         """
         self._write_checkpoint()
         self.commit()
-        if self._file.is_open and not self._full:
-            self._checkpoint = self._number, self._compressor.submit(zlib.compress, body, 1)
+        if not self._file.is_open or self._full:
+            return
+        try:
+            self._checkpoint = self._number, self._compressed(body)
+        except RuntimeError:  # there is no thread to be had
+            self.counters["store_checkpoints_put_off"] += 1
 
     def checkpointed(self) -> bytes | None:
         """Return the newest checkpoint, or None."""
@@ -175,6 +179,7 @@ class Journal:
         self.commit()
         self._write_checkpoint()
         self._close()
+        self._compressor.shutdown(wait=False)
 
     # inside
 
@@ -235,6 +240,9 @@ class Journal:
             self.counters["store_epoch_unreadable"] += 1
             return len(self._file.all_aside()) % BOOT_EPOCHS
 
+    def _compressed(self, body: bytes) -> Future[bytes]:
+        return self._compressor.submit(zlib.compress, body, 1)
+
     def _write_rows(self) -> None:
         self._file.write(self._full)
         self.counters["store_commits"] += 1
@@ -251,6 +259,8 @@ class Journal:
             self.counters["store_checkpoints"] += 1
         except sqlite3.Error:
             self.counters["store_commits_failed"] += 1
+        except MemoryError:  # the rows are still there
+            self.counters["store_checkpoints_put_off"] += 1
 
     def _lose_from_the_start(self, error: Exception) -> None:
         """Go on in memory, in an epoch by the clock: the disk does not count this life."""
@@ -262,6 +272,7 @@ class Journal:
         self.counters["store_lost"] += 1
         LOG.warning("store %s: %s; the mission goes on in memory", self._file.path, error)
         self._close()
+        self._compressor.shutdown(wait=False)
 
     def _close(self) -> None:
         self._file.close()

@@ -1,4 +1,5 @@
 import sqlite3
+from concurrent.futures import Future
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +54,29 @@ def test_checkpoint_takes_the_place_of_what_led_to_it(tmp_path: Path) -> None:
     journal = opened(tmp_path)
     assert journal.checkpointed() == b"the core"
     assert list(journal.replay()) == [(2, b"after")]
+
+
+@pytest.mark.parametrize("trouble", [MemoryError, RuntimeError("can't start new thread")])
+def test_checkpoint_that_cannot_be_made_leaves_the_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trouble: Exception
+) -> None:
+    def refused(*_: object) -> Future[bytes]:
+        if isinstance(trouble, RuntimeError):
+            raise trouble
+        failed: Future[bytes] = Future()
+        failed.set_exception(trouble)
+        return failed
+
+    journal = opened(tmp_path)
+    monkeypatch.setattr(journal, "_compressed", refused)
+    journal.append(1, b"before")
+    journal.checkpoint(b"the core")
+    journal.append(2, b"after")
+    journal.close()
+    assert journal.counters["store_checkpoints_put_off"] == 1
+    journal = opened(tmp_path)
+    assert journal.checkpointed() is None
+    assert list(journal.replay()) == [(1, b"before"), (2, b"after")]
 
 
 def test_start_is_that_of_the_first_life(tmp_path: Path) -> None:

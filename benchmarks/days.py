@@ -109,7 +109,8 @@ def mission(settings: MissionSettings, terrain: Path | None, seed: int) -> Itera
             link.send(
                 Aboard(
                     vehicle=vehicle.index,
-                    settings=settings,
+                    settings=settings.follower if vehicle.index else settings.leader,
+                    slots=settings.slots,
                     start=deployed(vehicle),
                     folder=Path(folder),
                 )
@@ -180,7 +181,7 @@ def main() -> None:
     print(HEAD)
     *rows, end = mission(settings, arguments.terrain, arguments.seed)
     hours = [row for row in rows if isinstance(row, Row)]
-    if len(hours) > 1:
+    if len(hours) > 2:
         ratio = hours[-1].steps_ms[1] / hours[1].steps_ms[1]
         print(f"99 % of the last hour's steps over that of the second: {ratio:.2f}")
     assert isinstance(end, Gauge)

@@ -12,19 +12,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Client, Connection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from firmware.dead_reckoning import ReckonedState
-from firmware.follower.core import FollowerCore
-from firmware.follower.journaled import JournaledFollower
 from firmware.journal import Journal, JournalSettings, Owner
-from firmware.leader.journaled import JournaledLeader
 from firmware.ports import SensorStep
-from host_tools.mission_settings import MissionSettings
 from host_tools.nodes import BeliefLog, FollowerNode, LeaderNode
-from protocol.schedule import Slots
+from protocol.schedule import Slots, SlotSettings
 
 PAGE_BYTES = resource.getpagesize()
 Heard = tuple[bytes, float | None, float]
@@ -35,7 +32,8 @@ class Aboard:
     """What a vehicle's process is told first; its store lies in a folder."""
 
     vehicle: int
-    settings: MissionSettings
+    settings: Any  # FollowerSettings or LeaderSettings, neither of which all vehicles know
+    slots: SlotSettings
     start: ReckonedState
     folder: Path
 
@@ -86,12 +84,12 @@ def serve(link: Connection) -> None:
             if order.gauge or order.compare:
                 link.send(_gauge(node, compare=order.compare))
                 continue
-            began_s = time.process_time()
+            began_s = time.thread_time()
             for heard in order.heard:
                 node.hear(*heard)
             orders.step = order.step
             frame = node.tick(order.now_s)
-            link.send((frame, time.process_time() - began_s))
+            link.send((frame, time.thread_time() - began_s))
     journal.close()
 
 
@@ -109,10 +107,9 @@ class _Orders(Iterator[SensorStep]):
 def _gauge(node: LeaderNode | FollowerNode, *, compare: bool) -> Gauge:
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     resident_mb = pages * PAGE_BYTES / 1e6
+    if isinstance(node, FollowerNode):
+        return Gauge(resident_mb=resident_mb, position_m=node.core.belief().position_m)
     core = node.core
-    if isinstance(core, FollowerCore):
-        position_m = core.belief().position_m
-        return Gauge(resident_mb=resident_mb, position_m=position_m)
     if compare:
         before_m = np.concatenate([core.trajectory(v).position_m for v in core.vehicles()])
         core.graph.solve_batch()
@@ -131,12 +128,17 @@ def _gauge(node: LeaderNode | FollowerNode, *, compare: bool) -> Gauge:
 
 
 def _node(aboard: Aboard, journal: Journal, orders: "_Orders") -> LeaderNode | FollowerNode:
-    slots, settings = Slots(aboard.settings.slots), aboard.settings
+    """Return the vehicle; the other kind's modules stay out of the process."""
+    slots, settings = Slots(aboard.slots), aboard.settings
     if aboard.vehicle == 0:
-        leader = JournaledLeader(journal, aboard.start, settings=settings.leader, slots=slots)
+        from firmware.leader.journaled import JournaledLeader  # noqa: PLC0415
+
+        leader = JournaledLeader(journal, aboard.start, settings=settings, slots=slots)
         return LeaderNode(leader, orders)
+    from firmware.follower.journaled import JournaledFollower  # noqa: PLC0415
+
     follower = JournaledFollower(
-        journal, aboard.vehicle, aboard.start, settings=settings.follower, slots=slots
+        journal, aboard.vehicle, aboard.start, settings=settings, slots=slots
     )
     return FollowerNode(follower, orders)
 

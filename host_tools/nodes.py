@@ -1,15 +1,17 @@
 """A vehicle in a mission: its simulated sensors joined to the core that would run aboard."""
 
 from collections.abc import Iterator
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from firmware.belief import Belief
 from firmware.dead_reckoning import ReckonedState
-from firmware.follower.core import FollowerCore
-from firmware.leader.core import LeaderCore
 from firmware.soundings import Odometry, Ping
+
+if TYPE_CHECKING:  # a follower's process holds nothing of the leader
+    from firmware.follower.core import FollowerCore
+    from firmware.leader.core import LeaderCore
 
 Steps = Iterator[tuple[Odometry, Ping | None]]
 
@@ -71,7 +73,7 @@ class Node(Protocol):
 class FollowerNode:
     """A follower with its sensors."""
 
-    def __init__(self, core: FollowerCore, steps: Steps) -> None:
+    def __init__(self, core: "FollowerCore", steps: Steps) -> None:
         self.core, self._steps, self.log = core, steps, BeliefLog()
 
     def hear(self, frame: bytes, toa_s: float | None, now_s: float) -> None:
@@ -90,7 +92,7 @@ class FollowerNode:
 class LeaderNode:
     """The leader with its sensors; matches run at once, so that a mission is deterministic."""
 
-    def __init__(self, core: LeaderCore, steps: Steps) -> None:
+    def __init__(self, core: "LeaderCore", steps: Steps) -> None:
         self.core, self._steps, self.log = core, steps, BeliefLog()
 
     def hear(self, frame: bytes, toa_s: float | None, now_s: float) -> None:
@@ -108,7 +110,7 @@ class LeaderNode:
         return self.core.poll(now_s)
 
 
-def _feed(core: FollowerCore | LeaderCore, steps: Steps) -> None:
+def _feed(core: "FollowerCore | LeaderCore", steps: Steps) -> None:
     step = next(steps, None)
     if step is None:
         return

@@ -53,7 +53,7 @@ _REACH_SHARE = 0.75  # of the kernel's: twenty evaluations do not find what more
 _PLACES_A_SPACING = 8.0  # steps: coarser costs error, finer bits
 _DEPTHS_AN_ERROR = 4.0  # steps of depth in the map's expected error
 _PLACE_EXPONENT, _DEPTH_EXPONENT = 8, 16  # steps are 2^(code - exponent) m
-_PACK_EVERY = 24  # evaluations: coding costs as much as two
+_PACK_EVERY = 10  # evaluations: coding costs as much as four, and half-way is worth sending
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

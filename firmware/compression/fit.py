@@ -193,7 +193,7 @@ def fit_steps(
     steps = minimise_steps(
         search.objective,
         search.start,
-        evaluations=max(iterations or settings.iterations, 1),
+        evaluations=max(settings.iterations if iterations is None else iterations, 1),
         first_move=0.2,
         largest_move=0.5,
     )

@@ -15,6 +15,7 @@ _SUFFICIENT = 1e-4  # Armijo
 _SHORTENINGS = 8  # of one step, then the search has failed
 _REMEMBERED = 0.8  # of the sums that tell each variable's curvature, from step to step
 _LEAST_CURVATURE = 0.1  # of a variable, in medians: below it one step says too little
+_MOST_CURVATURE = 1e4  # nor that a variable which hardly moved is stiff beyond measure
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,9 +64,7 @@ def minimise_steps(
         reach = float(np.abs(direction).max())
         if not np.isfinite(reach) or reach == 0.0:
             return "converged"
-        step = min(1.0, (largest_move if past.pairs else first_move) / reach)
-        if not past.pairs:
-            step = first_move / reach
+        step = min(1.0, largest_move / reach) if past.pairs else first_move / reach
         for _ in range(_SHORTENINGS):
             trial = yield from objective(x + step * direction)
             used += 1
@@ -133,5 +132,6 @@ class _Past:
         assert self._squares is not None
         turned, changed = self._squares + np.finfo(float).tiny
         curvature = np.sqrt(turned / changed)
-        curvature = np.maximum(curvature, _LEAST_CURVATURE * np.median(curvature))
+        usual = np.median(curvature)
+        curvature = np.clip(curvature, _LEAST_CURVATURE * usual, _MOST_CURVATURE * usual)
         return np.asarray(1.0 / np.sqrt(curvature))

@@ -27,7 +27,9 @@ from firmware.leader.screening import ErrorSurface
 
 _LEAST_BACKGROUND = 20  # shifts; fewer say nothing about the background
 _FLUCTUATIONS = 1.5  # sigmas of a mean square by which two right shifts may differ
-_LEAST_MISFIT = 0.5  # noise is seldom less than half of what is assumed
+_LEAST_FLUCTUATION = 0.2  # noise is not known to better than that
+_UNSTRAINED_MISFIT = 0.8  # what the noise model alone leaves at the best shift, or less
+LEAST_MISFIT = 0.5  # noise is seldom less than half of what is assumed
 _LEAST_GAIN = 0.3  # f(1) of a background of 2.3; below it the surface hardly has a minimum
 
 
@@ -80,14 +82,14 @@ def background(surface: ErrorSurface, best_m: Array, away_m: float) -> float | N
 def tolerated_misfit(misfit: float, independent_cells: float) -> float:
     """Return the E / noise up to which a shift counts as good as the best, whose is given.
 
-    Mean squares of so many independent cells fluctuate, by a tenth at least; neighbours in a
+    Mean squares of so many independent cells fluctuate, by a fifth at least; neighbours in a
     reconstruction err together, and few are independent. Where even the best fits worse than the
     noise allows, something unmodelled with few degrees of freedom is at work (strain within a
     sub-map), and differences of its own size mean nothing.
     """
     fluctuation = _FLUCTUATIONS * math.sqrt(2.0 / max(independent_cells, 1.0))
-    strained = max(misfit - 0.8, 0.0)
-    return max(misfit * (1.0 + max(fluctuation, 0.2) + strained), _LEAST_MISFIT)
+    strained = max(misfit - _UNSTRAINED_MISFIT, 0.0)
+    return max(misfit * (1.0 + max(fluctuation, _LEAST_FLUCTUATION) + strained), LEAST_MISFIT)
 
 
 def log_evidence(

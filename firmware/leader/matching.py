@@ -17,6 +17,7 @@ from firmware.submaps import GriddedSubmap
 from protocol.errors import EstimationError
 
 _WARPED_NOISE = 0.35  # of the cells' variance: taking drift out of a grid averages neighbours
+_HINT_TOLERANCE = 1.2  # of the best misfit; that of a hint tells a line of shifts, not one
 _NOTHING_GAINED = 0.95  # share of the prior's variance left: that axis is as unknown as before
 _NO_INFORMATION = 1e4  # variances of the prior
 _NEGLIGIBLE = 1e-6  # mass beside the best lattice shift's that is not worth refining
@@ -121,7 +122,8 @@ def _hint(
     """Return the factor between prior and moments of the posterior, widened; None if it is weak."""
     misfit = surface.residual_m2 / surface.noise_m2
     is_own = not (problem.reference.reconstructed or problem.query.reconstructed)
-    scale = max(1.2 * float(misfit.min()), _WARPED_NOISE if is_own else 0.5)
+    least = _WARPED_NOISE if is_own else ambiguity.LEAST_MISFIT
+    scale = max(_HINT_TOLERANCE * float(misfit.min()), least)
     relief = replace(
         relief,
         noise_scale=scale,

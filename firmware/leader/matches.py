@@ -1,7 +1,6 @@
 """What matching is told and what it answers: settings, a match, or the reason for none."""
 
 import enum
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 from firmware.geometry import Array
@@ -161,12 +160,3 @@ class MatchOutcome:
     match: Match | None
     reason: NoMatch | None
     hint: Hint | None = None
-
-
-def count_reasons(outcomes: Iterable[MatchOutcome]) -> dict[NoMatch, int]:
-    """Return how often each reason occurred."""
-    counts = dict.fromkeys(NoMatch, 0)
-    for outcome in outcomes:
-        if outcome.reason is not None:
-            counts[outcome.reason] += 1
-    return counts

@@ -15,7 +15,7 @@ from firmware.leader.manoeuvre import (
     relief_information,
 )
 from firmware.leader.observability import Observability, observe
-from firmware.leader.offsets import corrections
+from firmware.leader.offsets import anchor_of, corrections
 from firmware.submaps import GriddedSubmap
 from protocol.errors import EstimationError
 
@@ -92,7 +92,7 @@ def situation_of(
     velocities_mps = np.array([_velocity(fleet, estimate, chain) for chain in chains])
     reach_m = float(np.hypot(*velocities_mps.T).max()) * settings.horizon_s
     sheets, places_m = _in_reach(list(atlas), estimate, positions_m, reach_m)
-    anchors = [estimate.anchor(s.id.chain, s.time_s, s.track) for s in sheets]
+    anchors = [anchor_of(sheet, estimate) for sheet in sheets]
     return Situation(
         names=tuple(name_of(vehicle) for vehicle in vehicles),
         positions_m=positions_m,

@@ -19,6 +19,7 @@ overlap.
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,6 +32,13 @@ _LEAST_FLUCTUATION = 0.2  # noise is not known to better than that
 _UNSTRAINED_MISFIT = 0.8  # what the noise model alone leaves at the best shift, or less
 LEAST_MISFIT = 0.5  # noise is seldom less than half of what is assumed
 _LEAST_GAIN = 0.3  # f(1) of a background of 2.3; below it the surface hardly has a minimum
+
+
+class Prior(NamedTuple):
+    """What the graph believes of the shift before the match."""
+
+    mean_m: Array  # (2,)
+    covariance_m2: Array  # (2, 2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,28 +135,26 @@ def tempered_evidence(surface: ErrorSurface, relief: Relief, correlated_cells: f
     return np.where(usable, np.maximum(evidence, 0.0), -np.inf)
 
 
-def moments(found: Posterior, prior_m: Array, covariance_m2: Array) -> tuple[Array, Array]:
+def moments(found: Posterior, prior: Prior) -> tuple[Array, Array]:
     """Return mean (2,) and covariance (2, 2) of the shift; what lies outside is as the prior."""
-    north, east = found.north_m - prior_m[0], found.east_m - prior_m[1]
+    north, east = found.north_m - prior.mean_m[0], found.east_m - prior.mean_m[1]
     by_north, by_east = found.mass.sum(axis=1), found.mass.sum(axis=0)
     mean = np.array([by_north @ north, by_east @ east])
     crossed = float(north @ found.mass @ east)
     second = np.array([[by_north @ north**2, crossed], [crossed, by_east @ east**2]])
-    second += found.outside * covariance_m2
-    return prior_m + mean, second - np.outer(mean, mean)
+    second += found.outside * prior.covariance_m2
+    return prior.mean_m + mean, second - np.outer(mean, mean)
 
 
-def posterior(
-    surface: ErrorSurface, evidence: Array, prior_m: Array, covariance_m2: Array, null_share: float
-) -> Posterior:
+def posterior(surface: ErrorSurface, evidence: Array, prior: Prior, null_share: float) -> Posterior:
     """Return the mass of every shift and of `elsewhere`.
 
     The prior is the graph's Gaussian, of which null_share is spread on nothing: the pose graph may
     be wrong, and then no shift is right.
     """
     cell_m = float(surface.north_m[1] - surface.north_m[0]) if surface.north_m.size > 1 else 1.0
-    spread = covariance_m2 + np.eye(2) * cell_m**2 / 12.0
-    north, east = surface.north_m - prior_m[0], surface.east_m - prior_m[1]
+    spread = prior.covariance_m2 + np.eye(2) * cell_m**2 / 12.0
+    north, east = surface.north_m - prior.mean_m[0], surface.east_m - prior.mean_m[1]
     inverse = np.linalg.inv(spread)
     square = (
         inverse[0, 0] * north[:, None] ** 2

@@ -1,14 +1,15 @@
 """Matching of two sub-maps: Eq. (8) and (10), what they leave open, and how sure the answer is."""
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
 from firmware.geometry import Array
 from firmware.leader import ambiguity
 from firmware.leader.alignment import Aligned, fields_of
+from firmware.leader.ambiguity import Prior
 from firmware.leader.covariance import Refined, measure
+from firmware.leader.hinting import hint_of
 from firmware.leader.matches import Hint, Match, MatchingSettings, MatchOutcome, NoMatch
 from firmware.leader.pair_problem import PairProblem, pair_problem, relief_of
 from firmware.leader.refinement import refine
@@ -16,10 +17,6 @@ from firmware.leader.screening import ErrorSurface
 from firmware.submaps import GriddedSubmap
 from protocol.errors import EstimationError
 
-_WARPED_NOISE = 0.35  # of the cells' variance: taking drift out of a grid averages neighbours
-_HINT_TOLERANCE = 1.2  # of the best misfit; that of a hint tells a line of shifts, not one
-_NOTHING_GAINED = 0.95  # share of the prior's variance left: that axis is as unknown as before
-_NO_INFORMATION = 1e4  # variances of the prior
 _NEGLIGIBLE = 1e-6  # mass beside the best lattice shift's that is not worth refining
 
 __all__ = ["Hint", "Match", "MatchOutcome", "MatchingSettings", "NoMatch", "match"]
@@ -68,7 +65,7 @@ def match(
     )
     if problem is None:
         return _none(NoMatch.EMPTY)
-    prior = _Prior(np.asarray(prior_shift_m), _checked(prior_covariance_m2))
+    prior = Prior(np.asarray(prior_shift_m), _checked(prior_covariance_m2))
     whole = problem.surface()
     surface = _window(whole, prior, problem)
     if surface is None or not np.isfinite(surface.residual_m2).any():
@@ -78,26 +75,20 @@ def match(
         return _none(NoMatch.FEATURELESS)
     outcome = _search(problem, surface, relief, prior, times_s)
     if outcome.match is None:
-        return replace(outcome, hint=_hint(problem, surface, relief, prior))
+        return replace(outcome, hint=hint_of(problem, surface, relief, prior))
     return outcome
-
-
-class _Prior(NamedTuple):
-    """What the graph believes of the shift before the match."""
-
-    mean_m: Array
-    covariance_m2: Array
 
 
 def _search(
     problem: PairProblem,
     surface: ErrorSurface,
     relief: ambiguity.Relief,
-    prior: _Prior,
+    prior: Prior,
     times_s: tuple[float | None, float | None],
 ) -> MatchOutcome:
     """Return the outcome of a screened pair: evidence, refinement, gates."""
-    found = _posterior(surface, _evidence(surface, relief), prior, problem)
+    null_share = problem.settings.null_share
+    found = ambiguity.posterior(surface, _evidence(surface, relief), prior, null_share)
     candidates = _refine_best(surface, found, prior, problem, times_s)
     if not candidates:
         return _none(NoMatch.UNSETTLED)
@@ -112,43 +103,8 @@ def _search(
         evidence[row, col] = max(evidence[row, col], value)
     scores = [value + c.log_prior for c, value in zip(candidates, refined, strict=True)]
     best = int(np.argmax(scores))
-    found = _posterior(surface, evidence, prior, problem)
+    found = ambiguity.posterior(surface, evidence, prior, null_share)
     return _decide(candidates[best], refined[best], found, prior, problem)
-
-
-def _hint(
-    problem: PairProblem, surface: ErrorSurface, relief: ambiguity.Relief, prior: _Prior
-) -> Hint | None:
-    """Return the factor between prior and moments of the posterior, widened; None if it is weak."""
-    misfit = surface.residual_m2 / surface.noise_m2
-    is_own = not (problem.reference.reconstructed or problem.query.reconstructed)
-    least = _WARPED_NOISE if is_own else ambiguity.LEAST_MISFIT
-    scale = max(_HINT_TOLERANCE * float(misfit.min()), least)
-    relief = replace(
-        relief,
-        noise_scale=scale,
-        information_per_cell=problem.information(scale),
-        coherent_cells=problem.settings.hint_overlap_m2 / problem.query.grid.cell_m**2,
-    )
-    evidence = ambiguity.tempered_evidence(surface, relief, problem.correlated_cells)
-    found = _posterior(surface, evidence, prior, problem)
-    mean_m, covariance_m2 = ambiguity.moments(found, prior.mean_m, prior.covariance_m2)
-    root = np.linalg.cholesky(prior.covariance_m2)
-    inverse = np.linalg.inv(root)
-    left, axes = np.linalg.eigh(inverse @ covariance_m2 @ inverse.T)  # shares of the prior
-    if left[0] > problem.settings.hint_gain:
-        return None
-    gained = left < _NOTHING_GAINED
-    share = np.where(gained, left / np.maximum(1.0 - left, 1e-3), 1.0)
-    moved = axes.T @ inverse @ (mean_m - prior.mean_m)
-    away = np.where(gained, moved / np.maximum(1.0 - left, 1e-3), 0.0)
-    sigmas = np.where(gained, share, _NO_INFORMATION)
-    frame = root @ axes
-    told_m2 = problem.settings.hint_scale * frame @ np.diag(sigmas) @ frame.T
-    return Hint(
-        shift_m=prior.mean_m + frame @ away,
-        covariance_m2=told_m2 + problem.settings.hint_floor_m**2 * np.eye(2),
-    )
 
 
 def _evidence(surface: ErrorSurface, relief: ambiguity.Relief) -> Array:
@@ -168,7 +124,7 @@ def _evidence_at(candidate: _Candidate, relief: ambiguity.Relief) -> float:
     )
 
 
-def _window(whole: ErrorSurface, prior: _Prior, problem: PairProblem) -> ErrorSurface | None:
+def _window(whole: ErrorSurface, prior: Prior, problem: PairProblem) -> ErrorSurface | None:
     """Return the part of the surface that the prior allows, None if it is empty."""
     settings = problem.settings
     half = settings.search_sigmas * np.sqrt(np.diag(prior.covariance_m2))
@@ -186,18 +142,10 @@ def _best(surface: ErrorSurface) -> Array:
     return np.array([surface.north_m[row], surface.east_m[col]])
 
 
-def _posterior(
-    surface: ErrorSurface, evidence: Array, prior: _Prior, problem: PairProblem
-) -> ambiguity.Posterior:
-    return ambiguity.posterior(
-        surface, evidence, prior.mean_m, prior.covariance_m2, problem.settings.null_share
-    )
-
-
 def _refine_best(
     surface: ErrorSurface,
     found: ambiguity.Posterior,
-    prior: _Prior,
+    prior: Prior,
     problem: PairProblem,
     times_s: tuple[float | None, float | None],
 ) -> list[_Candidate]:
@@ -253,7 +201,7 @@ def _decide(
     winner: _Candidate,
     evidence: float,
     found: ambiguity.Posterior,
-    prior: _Prior,
+    prior: Prior,
     problem: PairProblem,
 ) -> MatchOutcome:
     """Return the winner as a closure in the plane or along one axis, or the gate it failed.

@@ -67,6 +67,13 @@ class WaterSettings(Settings):
         maximum=1.0,
     )
     outlier_factor: float = setting(1.1, "", "Eq. 14: delta_r", minimum=0.1)
+    clock_offset_ms: float = setting(
+        0.0, "ms", "a sender's clock behind node 0's: its frames seem to travel longer",
+        minimum=-1000.0, maximum=1000.0,
+    )  # fmt: skip
+    clock_drift_ppm: float = setting(
+        0.0, "ppm", "by which that grows", minimum=-1000.0, maximum=1000.0
+    )
     reach_m: float = setting(
         20_000.0,
         "m",
@@ -214,6 +221,7 @@ class Water:
         noise_m = settings.range_noise_m * self._draw("noise", link).standard_normal()
         factor = settings.outlier_factor if is_outlier else 1.0
         measured_s = now_s + factor * travel_s + noise_m / settings.sound_speed_mps
+        measured_s += self._late_s(source, now_s) - self._late_s(destination, now_s)
         is_lost = self._packet_is_lost(link, len(frame), self._is_lost(link))
         is_lost |= 0.0 <= now_s / 60.0 - settings.silent_from_min < settings.silent_min
         is_corrupt = self._draw("corruption", link).random() < settings.corruption
@@ -237,6 +245,12 @@ class Water:
             has_echo and fate in {"delivered", "corrupt"},
         )
         self._push(max(arrival.begins_s, measured_s) + duration_s, arrival)
+
+    def _late_s(self, node: int, now_s: float) -> float:
+        """Return by how much a node's clock is behind that of node 0."""
+        if node == 0:
+            return 0.0
+        return 1e-3 * self.settings.clock_offset_ms + 1e-6 * self.settings.clock_drift_ppm * now_s
 
     def _decide(self, arrival: _Arrival, decided_s: float) -> Delivery:
         """Return the fate, now that everything that could sound at the same time has begun."""

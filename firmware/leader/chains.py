@@ -13,13 +13,16 @@ from firmware.leader.trajectory import Trajectory
 
 @dataclass(slots=True)
 class Chain:
-    """The nodes of one vehicle, in time order, and the key of its parameters.
+    """The nodes of one vehicle, in time order, and the keys of its parameters and of its clock.
+
+    There is no clock where none is estimated.
 
     `shape` is the estimate, as it was, of the part of which only some nodes are left.
     """
 
     number: int
     parameters: int
+    clock: int | None = None
     times_s: list[float] = field(default_factory=list)
     reckoned_m: list[Array] = field(default_factory=list)
     keys: list[int] = field(default_factory=list)

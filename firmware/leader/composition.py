@@ -114,7 +114,8 @@ class Composition:
 
     owners maps each dropped node to the one it is added to, apart_m2 to the covariance (2, 2) of
     the way between the two; old holds the keys of the nodes before the window of detail; estimate
-    has the position (2,) of every node, dropped ones among them, and every vehicle's parameters.
+    has the position (2,) of every node, dropped ones among them, and each vehicle's parameters and
+    clock (2,).
     """
 
     def __init__(
@@ -188,7 +189,7 @@ class Composition:
         moved = replace(record, origin=origin, target=target)
         if isinstance(moved, ClosureRecord):
             return replace(moved, covariance_m2=moved.covariance_m2 + spread_m2)
-        _, direction = moved.innovation_m(*self._ends_m(moved))
+        _, direction = self._range_innovation_m(moved)
         variance_m2 = moved.sigma_m**2 + float(direction @ spread_m2 @ direction)
         return replace(moved, sigma_m=float(np.sqrt(variance_m2)))
 
@@ -197,6 +198,10 @@ class Composition:
 
     def _ends_m(self, record: ClosureRecord | RangeRecord) -> tuple[Array, Array]:
         return self._estimate[record.origin.key], self._estimate[record.target.key]
+
+    def _range_innovation_m(self, record: RangeRecord) -> tuple[float, Array]:
+        clock = None if record.clock is None else self._estimate[record.clock]
+        return record.innovation_m(*self._ends_m(record), clock)
 
     def _innovation_m(self, record: ClosureRecord) -> Array:
         ends = record.origin, record.target
@@ -248,8 +253,8 @@ class Composition:
     def _one_range(self, records: list[RangeRecord]) -> RangeRecord:
         """Return the one in the middle with the mean of all innovations."""
         middle = records[len(records) // 2]
-        innovations_m = [record.innovation_m(*self._ends_m(record))[0] for record in records]
-        own_m = middle.innovation_m(*self._ends_m(middle))[0]
+        innovations_m = [self._range_innovation_m(record)[0] for record in records]
+        own_m = self._range_innovation_m(middle)[0]
         sigma_m = float(np.sqrt(np.sum([r.sigma_m**2 for r in records])) / len(records))
         return replace(
             middle,

@@ -11,7 +11,7 @@ import numpy as np
 from firmware.geometry import Array
 from firmware.leader.chains import Chain
 from firmware.leader.graph_settings import GraphSettings
-from firmware.leader.ledger import Anchor, ClosureRecord, Entry
+from firmware.leader.ledger import Anchor, ClosureRecord, Entry, clock_row
 from firmware.leader.solver import Solver
 from firmware.leader.trajectory import Trajectory
 from firmware.leader.wander import DriftChange, Wandering, changes_of
@@ -101,6 +101,19 @@ class Estimate:
     def parameters(self, vehicle: int) -> Array:
         """Return a vehicle's heading bias in rad and log scale, (2,)."""
         return self._state(self._chains[vehicle].parameters)
+
+    def clock(self, vehicle: int, time_s: float) -> tuple[float, float]:
+        """Return by how much a vehicle's clock lengthens a range sent at the time, and the sigma.
+
+        Both are in m, and zero where no clock is estimated.
+        """
+        key = self._chains[vehicle].clock
+        if key is None:
+            return 0.0, 0.0
+        self.update()
+        row = clock_row(time_s)
+        variance_m2 = float(row @ self._solver.covariance([key]) @ row)
+        return float(row @ self._state(key)), float(np.sqrt(variance_m2))
 
     def position(self, anchor: Anchor) -> Array:
         """Return the estimated position (2,) of an anchor."""
@@ -216,11 +229,12 @@ class Estimate:
         return self._solver.state(key)
 
     def _states(self) -> dict[int, Array]:
-        """Return the estimate of every node's state (4,) and every vehicle's parameters (2,)."""
+        """Return every node's state (4,), and every vehicle's parameters (2,) and clock (2,)."""
         return {
             key: self._state(key)
             for chain in self._chains.values()
-            for key in (*chain.keys, chain.parameters)
+            for key in (*chain.keys, chain.parameters, chain.clock)
+            if key is not None
         }
 
     def _joint_covariance(

@@ -133,14 +133,20 @@ def _closure(record: ClosureRecord, noise: gtsam.noiseModel.Base) -> gtsam.Nonli
 
 def _range(record: RangeRecord, noise: gtsam.noiseModel.Base) -> gtsam.NonlinearFactor:
     keys = [record.origin.key, record.target.key]
+    if record.clock is not None:
+        keys.append(record.clock)
 
     def error(_this: object, values: gtsam.Values, jacobians: _Jacobians) -> Array:
         miss_m, direction = record.innovation_m(
-            values.atVector(keys[0])[:2], values.atVector(keys[1])[:2]
+            values.atVector(keys[0])[:2],
+            values.atVector(keys[1])[:2],
+            *(values.atVector(key) for key in keys[2:]),
         )
         if jacobians is not None:
             towards = (direction @ _POSITION)[None, :]
             jacobians[0], jacobians[1] = -towards, towards
+            if record.clock is not None:
+                jacobians[2] = record.by_clock[None, :]
         return np.array([miss_m])
 
     return _custom(noise, keys, error)

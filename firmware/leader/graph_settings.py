@@ -6,6 +6,8 @@ import numpy as np
 
 from protocol.settings import Settings, setting
 
+_SOUND_MPS = 1500.0  # turns times into ranges; a prior needs it no better
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GraphSettings(Settings):
@@ -52,12 +54,29 @@ class GraphSettings(Settings):
         "noise of a range (1 m, Eq. 13), of the way to its key frames, and bend",
         minimum=1e-3,
     )
+    clock_offset_sigma_ms: float = setting(
+        0.0, "ms", "of a follower's clock against ours; 0: disciplined, nothing is estimated",
+        minimum=0.0, maximum=100.0,
+    )  # fmt: skip
+    clock_drift_sigma_ppm: float = setting(
+        0.0, "ppm", "of its rate, where an offset is estimated: 1 for a fair crystal", minimum=0.0
+    )
     closure_floor_m: float = setting(
         0.4, "m", "strain within a sub-map that no match can see", minimum=0.0
     )
     robust_kernel: float = setting(
         3.0, "sigma", "Huber: convex, so that large true innovations cannot stick", minimum=0.1
     )
+
+    @property
+    def clock_offset_sigma_m(self) -> float:
+        """How far sound goes in the sigma of a clock's offset."""
+        return _SOUND_MPS * 1e-3 * self.clock_offset_sigma_ms
+
+    @property
+    def clock_drift_sigma_mph(self) -> float:
+        """By how many metres an hour that may grow."""
+        return _SOUND_MPS * 3600e-6 * self.clock_drift_sigma_ppm
 
     def start_sigma_at(self, time_s: float) -> float:
         """Return how uncertain a chain begins that is first heard of, or begun anew, at a time.

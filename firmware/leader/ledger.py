@@ -10,6 +10,7 @@ import numpy as np
 
 from firmware.geometry import Array
 
+_HOUR_S = 3600.0
 QUARTER_TURN = np.array([[0.0, -1.0], [1.0, 0.0]])
 
 
@@ -101,21 +102,39 @@ class ClosureRecord:
         return np.asarray(target - origin - self.offset_m)
 
 
+def clock_row(time_s: float) -> Array:
+    """Return what a clock's offset in m and rate in m/h add to a range sent at the time, (2,)."""
+    return np.array([1.0, time_s / _HOUR_S])
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RangeRecord:
-    """A one-way range between two anchors: the third line of Eq. 11."""
+    """A one-way range between two anchors: the third line of Eq. 11.
+
+    The target sent, by a clock that may err: by how far sound goes in that time at mission time
+    zero, in m, and in m/h.
+    """
 
     origin: Anchor
     target: Anchor
     range_m: float
     sigma_m: float
+    clock: int | None = None
 
-    def innovation_m(self, origin_m: Array, target_m: Array) -> tuple[float, Array]:
+    @property
+    def by_clock(self) -> Array:
+        """How the range grows with the state (2,) of the sender's clock."""
+        return clock_row(self.target.time_s)
+
+    def innovation_m(
+        self, origin_m: Array, target_m: Array, clock: Array | None = None
+    ) -> tuple[float, Array]:
         """Return estimated minus measured range, and the unit vector (2,) from origin to target."""
         between_m = target_m + self.target.offset_m - origin_m - self.origin.offset_m
         distance_m = float(np.hypot(*between_m))
         direction = between_m / distance_m if distance_m > 1e-6 else np.array([1.0, 0.0])
-        return distance_m - self.range_m, direction
+        late_m = 0.0 if clock is None else float(self.by_clock @ clock)
+        return distance_m + late_m - self.range_m, direction
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

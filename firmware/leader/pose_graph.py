@@ -35,6 +35,8 @@ from firmware.leader.ledger import (
 from firmware.leader.wander import expected_walk, likely_walk
 from firmware.submaps import Track
 
+_STEADY_MPH = 0.01  # of a clock whose rate is not asked for
+
 
 class PoseGraph(Estimate):
     """Every vehicle's trajectory, and what ties them together: an estimate that is told."""
@@ -61,6 +63,8 @@ class PoseGraph(Estimate):
         s = self._settings
         number = len(self._chains)
         chain = Chain(number=number, parameters=gtsam.symbol("p", number))
+        if number > 0 and s.clock_offset_sigma_ms > 0.0:
+            chain.clock = self._clock_of(number, like)
         self._chains[vehicle] = chain
         state = np.concatenate([start_m, np.zeros(2)])
         key = self._append(chain, time_s, reckoned_m, state)
@@ -116,15 +120,27 @@ class PoseGraph(Estimate):
         return self._enter(record, active=active)
 
     def add_range(
-        self, origin: Anchor, target: Anchor, range_m: float, spread_m: float = 0.0
+        self,
+        origin: Anchor,
+        target: Anchor,
+        range_m: float,
+        spread_m: float = 0.0,
+        *,
+        sender: int | None = None,
     ) -> int:
         """Enter a one-way range between two anchors, active, and return its number.
 
-        spread_m is its sigma beside that of the settings.
+        spread_m is its sigma beside that of the settings; the target is of the sender, whose clock
+        may err.
         """
-        sigma_m = float(np.hypot(self._settings.range_sigma_m, spread_m))
         return self._enter(
-            RangeRecord(origin=origin, target=target, range_m=range_m, sigma_m=sigma_m)
+            RangeRecord(
+                origin=origin,
+                target=target,
+                range_m=range_m,
+                sigma_m=float(np.hypot(self._settings.range_sigma_m, spread_m)),
+                clock=None if sender is None else self._chains[sender].clock,
+            )
         )
 
     def add_absolute(self, anchor: Anchor, position_m: Array, covariance_m2: Array) -> int:
@@ -203,6 +219,17 @@ class PoseGraph(Estimate):
         state[:2] += moved_m - state[2:] * (time_s - chain.times_s[-1])
         self._append(chain, time_s, reckoned_m, state)
         self._join(chain, len(chain.keys) - 1)
+
+    def _clock_of(self, number: int, like: int | None) -> int:
+        """Return the key of a chain's clock: that of an earlier boot, or a new one."""
+        earlier = None if like is None else self._chains[like].clock
+        if earlier is not None:
+            return earlier
+        key, s = gtsam.symbol("c", number), self._settings
+        self._solver.introduce(key, np.zeros(2))
+        sigmas = np.array([s.clock_offset_sigma_m, max(s.clock_drift_sigma_mph, _STEADY_MPH)])
+        self._enter(PriorRecord(key=key, mean=np.zeros(2), sigmas=sigmas))
+        return int(key)
 
     def _join(self, chain: Chain, node: int) -> None:
         noise = self._settings.odometry_noise

@@ -27,9 +27,15 @@ class _HeldRange:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _PlacedRange:
-    """A range between two anchors of the graph, with what the graph predicts for it."""
+    """A range between two anchors of the graph, with what the graph predicts for it.
 
+    clock_m of it are the sender's clock's, as far as that is known.
+    """
+
+    sender: int
     range_m: float
+    clock_m: float
+    clock_sigma_m: float
     here: Anchor
     there: Anchor
     predicted_m: float
@@ -125,7 +131,7 @@ class Ranging:
             try:
                 here = graph.anchor(receiver[0], held.arrived_s, receiver[1])
                 there = graph.anchor(sender[0], held.sent_s, sender[1])
-                placed.append(_placed(held, here, there, graph))
+                placed.append(_placed(held, here, there, sender[0], graph))
             except EstimationError:
                 self.counters["ranges_unplaceable"] += 1
         return placed
@@ -136,7 +142,7 @@ class Ranging:
         if bent_m > self._settings.bent_m:
             return _Fate.BENT
         verdict = self._judge.judge(
-            np.array([p.range_m for p in placed]),
+            np.array([p.range_m - p.clock_m for p in placed]),
             np.array([p.predicted_m for p in placed]),
             np.array([p.there.time_s for p in placed]),
             float(np.hypot(along_m, bent_m)),
@@ -145,14 +151,16 @@ class Ranging:
             return _Fate.UNDECIDED
         for k, p in enumerate(placed):
             if verdict.true[k]:
-                graph.add_range(p.here, p.there, p.range_m, bent_m)
+                range_m = p.range_m
                 self.counters["ranges_used"] += 1
             elif verdict.stretched[k]:
-                unstretched_m = p.range_m / self._settings.outlier_factor
-                graph.add_range(p.here, p.there, unstretched_m, bent_m)
+                way_m = (p.range_m - p.clock_m) / self._settings.outlier_factor
+                range_m = p.clock_m + way_m
                 self.counters["ranges_unstretched"] += 1
             else:
                 self.counters["ranges_rejected"] += 1
+                continue
+            graph.add_range(p.here, p.there, range_m, bent_m, sender=p.sender)
         return _Fate.ENTERED
 
 
@@ -166,16 +174,22 @@ def _spread(placed: _PlacedRange, graph: PoseGraph) -> tuple[float, float]:
     between = np.hstack([-np.eye(2), np.eye(2)])
     covariance_m2 = between @ graph.covariance([placed.here, placed.there]) @ between.T
     along, across = placed.direction, np.array([-placed.direction[1], placed.direction[0]])
-    along_m2 = float(along @ covariance_m2 @ along)
+    along_m2 = float(along @ covariance_m2 @ along) + placed.clock_sigma_m**2
     bent_m = float(across @ covariance_m2 @ across) / (np.sqrt(2.0) * placed.predicted_m + 1e-3)
     return float(np.sqrt(max(along_m2, 1e-6))), bent_m
 
 
-def _placed(held: _HeldRange, here: Anchor, there: Anchor, graph: PoseGraph) -> _PlacedRange:
+def _placed(
+    held: _HeldRange, here: Anchor, there: Anchor, sender: int, graph: PoseGraph
+) -> _PlacedRange:
+    clock_m, clock_sigma_m = graph.clock(sender, held.sent_s)
     between_m = graph.position(there) - graph.position(here)
     predicted_m = float(np.hypot(*between_m))
     return _PlacedRange(
+        sender=sender,
         range_m=held.range_m,
+        clock_m=clock_m,
+        clock_sigma_m=clock_sigma_m,
         here=here,
         there=there,
         predicted_m=predicted_m,

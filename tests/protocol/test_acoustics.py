@@ -87,6 +87,21 @@ def test_a_node_cannot_transmit_twice_at_once() -> None:
     medium.transmit(0, 2.048, FRAME)
 
 
+def test_clock_that_is_behind_lengthens_its_own_frames_and_shortens_what_it_hears() -> None:
+    late = WaterSettings(
+        loss=0.0,
+        outlier_share=0.0,
+        range_noise_m=0.0,
+        clock_offset_ms=10.0,
+        clock_drift_ppm=100.0,
+    )
+    medium = water(late, at(0.0, 1500.0))
+    medium.transmit(1, 100.0, FRAME)
+    medium.transmit(0, 200.0, FRAME)
+    arrivals_s = [delivery.t_rx_s for delivery in medium.deliveries_until(300.0)]
+    assert arrivals_s == [pytest.approx(101.0 + 0.02), pytest.approx(201.0 - 0.03)]
+
+
 def test_loss_has_its_share() -> None:
     settings = WaterSettings(loss=0.14)
     fates = [d.fate for d in run(water(settings, at(0.0, 500.0)), 5000)]

@@ -67,6 +67,13 @@ class TrackBuffer:
         return Track(time_s=time_s, north_m=north_m, east_m=east_m, yaw_rad=yaw_rad)
 
     def settle(self, before_s: float) -> None:
-        """Forget which states before a time are known: none of them will come again."""
+        """Forget which states before a time are known: none of them will come again.
+
+        The newest is kept, however old: after a long silence the next one is held against it.
+        """
         self.track()
-        self._states = {q: state for q, state in self._states.items() if q >= 4.0 * before_s}
+        self._states = {
+            quarter: state
+            for quarter, state in self._states.items()
+            if quarter >= 4.0 * before_s or quarter == self._newest
+        }

@@ -32,7 +32,7 @@ class MatchingSettings(Settings):
         minimum=0.0,
     )
     hint_overlap_m2: float = setting(
-        2000.0, "m^2", "the same for a hint, which chooses no ripple", minimum=0.0
+        4000.0, "m^2", "the same for a hint, which chooses no ripple", minimum=0.0
     )
     search_sigmas: float = setting(3.0, "", "99 % of the prior's mass", minimum=1.0)
     search_cap_m: float = setting(200.0, "m", "beyond it sub-maps do not meet", minimum=1.0)

@@ -35,7 +35,7 @@ def test_faint_relief_leaves_hints_as_sure_as_they_say() -> None:
         gains.append(0.5 * np.log(np.linalg.det(PRIOR_M2) / np.linalg.det(covariance_m2)))
     assert len(squares) >= 6
     assert np.mean(squares) < 2.6  # two degrees of freedom; tempered evidence stays below
-    assert np.mean(gains) > 0.4  # nats: two thirds of the prior's area are left, or less
+    assert np.mean(gains) > 0.7  # nats: half of the prior's area each, or less
 
 
 def test_seabed_without_relief_leaves_no_hint() -> None:

@@ -74,7 +74,7 @@ class GraphSettings(Settings):
         return _SOUND_MPS * 1e-3 * self.clock_offset_sigma_ms
 
     @property
-    def clock_drift_sigma_mph(self) -> float:
+    def clock_drift_sigma_m_per_h(self) -> float:
         """By how many metres an hour that may grow."""
         return _SOUND_MPS * 3600e-6 * self.clock_drift_sigma_ppm
 

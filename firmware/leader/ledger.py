@@ -111,8 +111,8 @@ def clock_row(time_s: float) -> Array:
 class RangeRecord:
     """A one-way range between two anchors: the third line of Eq. 11.
 
-    The target sent, by a clock that may err: by how far sound goes in that time at mission time
-    zero, in m, and in m/h.
+    The target sent, by a clock that may be behind. A clock's state is by how much that lengthens
+    ranges: in m at mission time zero, and in m/h.
     """
 
     origin: Anchor

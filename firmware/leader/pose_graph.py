@@ -35,7 +35,7 @@ from firmware.leader.ledger import (
 from firmware.leader.wander import expected_walk, likely_walk
 from firmware.submaps import Track
 
-_STEADY_MPH = 0.01  # of a clock whose rate is not asked for
+_STEADY_M_PER_H = 0.01  # of a clock whose rate is not asked for
 
 
 class PoseGraph(Estimate):
@@ -227,7 +227,8 @@ class PoseGraph(Estimate):
             return earlier
         key, s = gtsam.symbol("c", number), self._settings
         self._solver.introduce(key, np.zeros(2))
-        sigmas = np.array([s.clock_offset_sigma_m, max(s.clock_drift_sigma_mph, _STEADY_MPH)])
+        drift_m_per_h = max(s.clock_drift_sigma_m_per_h, _STEADY_M_PER_H)
+        sigmas = np.array([s.clock_offset_sigma_m, drift_m_per_h])
         self._enter(PriorRecord(key=key, mean=np.zeros(2), sigmas=sigmas))
         return int(key)
 

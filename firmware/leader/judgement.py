@@ -45,9 +45,6 @@ class JudgementSettings(Settings):
         4, "pairs", "of neighbouring sub-maps asked; each costs as much as a match", minimum=1
     )
     vote_ratio: float = setting(3.0, "log ratio", "twenty to one that the map agrees", minimum=0.0)
-    odometry_noise: float = setting(
-        0.2, "m/sqrt(s)", "random part of dead reckoning between closures", minimum=1e-4
-    )
     drift_sigma_mps: float = setting(
         0.05, "m/s", "drift that remains once the estimated one is taken out", minimum=1e-4
     )
@@ -208,7 +205,7 @@ class _Odometry:
                 (c.target.chain, c.target_anchor.time_s, c.target_reckoned_m),
             )
         ]
-        self._settings = settings
+        self._noise, self._drift_sigma_mps = graph.wandering.noise, settings.drift_sigma_mps
         self._vehicle = np.array([vehicle for vehicle, _, _ in ends])
         self._time_s = np.array([time_s for _, time_s, _ in ends])
         self._position_m = np.array(
@@ -220,10 +217,9 @@ class _Odometry:
 
     def __call__(self, first: Keys, second: Keys) -> tuple[Array, Array]:
         """Return offsets (P, 2) and covariances (P, 2, 2), NaN between vehicles."""
-        s = self._settings
         apart_s = np.abs(self._time_s[second] - self._time_s[first])
         offset_m = self._position_m[second] - self._position_m[first]
-        variance_m2 = s.odometry_noise**2 * apart_s + (s.drift_sigma_mps * apart_s) ** 2
+        variance_m2 = self._noise**2 * apart_s + (self._drift_sigma_mps * apart_s) ** 2
         other = self._vehicle[first] != self._vehicle[second]
         offset_m[other], variance_m2[other] = np.nan, np.nan
         return offset_m, variance_m2[:, None, None] * np.eye(2)

@@ -30,6 +30,9 @@ class CalibrationSettings(Settings):
     smile_sigma: float = setting(
         0.004, "1", "sound speed wrong by 3 m/s, seen at 60 degrees", minimum=1e-6
     )
+    opening_deg: float = setting(
+        120.0, "deg", "of the sonars, which tells altitude from width", minimum=10.0, maximum=170.0
+    )
     wander_m: float = setting(
         0.3, "m", "tide and depth sensor between two distant passes", minimum=0.001
     )

@@ -9,6 +9,7 @@ import numpy as np
 from firmware.geometry import Array
 from firmware.leader.atlas import SheetId
 from firmware.leader.closure_settings import ClosureSettings
+from firmware.leader.displacement import displaced
 from firmware.leader.ledger import Anchor
 from firmware.leader.match_jobs import MatchJob
 from firmware.leader.matching import Hint, MatchOutcome
@@ -52,7 +53,8 @@ def closure_of(
     """Return the closure that a match found, or None.
 
     The shift lies between the grids as they agree with dead reckoning at their own instants; the
-    closure is stated between the positions at the mean times of the overlap.
+    closure is stated between the positions at the mean times of the overlap, and for the place
+    where both really looked.
     """
     if outcome.match is None:
         return None
@@ -65,14 +67,15 @@ def closure_of(
         ends_m.append(sheet.reckoned_at(time_s) - drift_mps * (time_s - sheet.time_s))
         anchor = graph.anchor(sheet.id.chain, time_s, sheet.track)
         anchors.append(dataclasses.replace(anchor, lever_m=centre_m - ends_m[-1]))
+    aside_m, aside_m2 = displaced(job.looks, (anchors[0].lever_m, anchors[1].lever_m))
     return Closure(
         time_s=now_s,
         origin=job.origin.id,
         target=job.target.id,
         origin_anchor=anchors[0],
         target_anchor=anchors[1],
-        offset_m=ends_m[1] + found.shift_m - ends_m[0],
-        covariance_m2=found.covariance_m2,
+        offset_m=ends_m[1] + found.shift_m - ends_m[0] + aside_m,
+        covariance_m2=found.covariance_m2 + aside_m2,
         residual=found.residual,
         misfit=found.residual / found.variance_m2,
         axis_deg=found.axis_deg,

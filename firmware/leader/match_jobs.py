@@ -7,6 +7,7 @@ import numpy as np
 from firmware.geometry import Array
 from firmware.leader.atlas import Atlas, Sheet, overlap_m2
 from firmware.leader.closure_settings import ClosureSettings
+from firmware.leader.displacement import Look
 from firmware.leader.estimate import Estimate
 from firmware.leader.matching import MatchingSettings, MatchOutcome, match
 from firmware.leader.offsets import Offset, correction_of, corrections, offsets_of
@@ -27,6 +28,7 @@ class MatchJob:
     prior_shift_m: Array
     prior_covariance_m2: Array
     settings: MatchingSettings
+    looks: tuple[Look, Look]
 
     @property
     def prior_sigma_m(self) -> float:
@@ -183,6 +185,7 @@ def _jobs(
             prior_shift_m=offset.shift_m,
             prior_covariance_m2=offset.covariance_m2,
             settings=calibrations.matching_of(origin, target, offset.shift_m),
+            looks=(calibrations.look_of(origin), calibrations.look_of(target)),
         )
         for origin, offset in pairs
     ]

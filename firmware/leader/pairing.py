@@ -13,6 +13,7 @@ from firmware.geometry import Array
 from firmware.leader.alignment import NoiseModel
 from firmware.leader.atlas import Sheet
 from firmware.leader.calibration import Calibration, Overlap
+from firmware.leader.displacement import Look
 from firmware.leader.matches import MatchingSettings
 from firmware.leader.pair_problem import noise_model
 from firmware.leader.swath import Swath, levelled, swath_of
@@ -88,6 +89,18 @@ class Calibrations:
     def level(self, side: Side) -> GriddedSubmap:
         """Return the grid of a side without the errors that its vehicle is known to make."""
         return levelled(side.grid, side.swath, self.of(side.sheet.id.vehicle).errors)
+
+    def look_of(self, side: Side) -> Look:
+        """Return how a side's vehicle looks at the seabed, and what is known of how it errs."""
+        calibration, half_width_m = self.of(side.sheet.id.vehicle), side.swath.half_width_m
+        return Look(
+            vehicle=side.sheet.id.vehicle,
+            starboard=side.starboard,
+            altitude_m=half_width_m / np.tan(np.radians(self._settings.opening_deg / 2.0)),
+            half_width_m=half_width_m,
+            errors=calibration.errors,
+            covariance=calibration.covariance,
+        )
 
     def matching_of(self, origin: Side, target: Side, shift_m: Array) -> MatchingSettings:
         """Return the settings of a match with the sigmas that remain for this pair."""

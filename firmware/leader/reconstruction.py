@@ -28,6 +28,8 @@ from protocol.settings import Settings, setting
 from protocol.timestamps import from_quarters
 
 _MAX_POINTS = 600  # ten frames hold fewer; the decoder's matrices are bounded by it
+_ABEAM_STEP_S = 1.0  # two metres of track: the size of a cell
+_NEARER_PASS = 1e-3  # of the square of the distance: decides only where a turn looks twice
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -228,14 +230,24 @@ def _inside(position_m: Array, north_m: Array, east_m: Array) -> NDArray[np.bool
 
 
 def times_of_cells(track: Track, north_m: Array, east_m: Array, wanted: NDArray[np.bool_]) -> Array:
-    """Return (R, C) the time of the state nearest to each wanted cell, NaN elsewhere."""
+    """Return (R, C) when each wanted cell was abeam, as the sonar looks; NaN elsewhere.
+
+    Abeam is by the heading: the track itself may drift aside. Where a turn sees a cell twice, the
+    nearer pass counts.
+    """
     time_s = np.full(wanted.shape, np.nan)
-    if track.time_s.size and wanted.any():
-        nearest_m2 = np.full(wanted.shape, np.inf)
-        for state in zip(track.north_m, track.east_m, track.time_s, strict=True):
-            apart_m2 = (north_m - state[0])[:, None] ** 2 + (east_m - state[1])[None, :] ** 2
-            nearer = apart_m2 < nearest_m2
-            np.copyto(nearest_m2, apart_m2, where=nearer)
-            np.copyto(time_s, state[2], where=nearer)
-        time_s[~wanted] = np.nan
+    if not track.time_s.size or not wanted.any():
+        return time_s
+    steps = int(np.ceil((track.time_s[-1] - track.time_s[0]) / _ABEAM_STEP_S)) + 1
+    times_s = np.linspace(track.time_s[0], track.time_s[-1], steps)
+    yaw_rad = np.interp(times_s, track.time_s, np.unwrap(track.yaw_rad))
+    least_m2 = np.full(wanted.shape, np.inf)
+    for here_m, yaw, at_s in zip(track.position_at(times_s), yaw_rad, times_s, strict=True):
+        north, east = (north_m - here_m[0])[:, None], (east_m - here_m[1])[None, :]
+        ahead_m = np.cos(yaw) * north + np.sin(yaw) * east
+        abeam_m2 = ahead_m**2 + _NEARER_PASS * (north**2 + east**2)
+        better = abeam_m2 < least_m2
+        np.copyto(least_m2, abeam_m2, where=better)
+        np.copyto(time_s, at_s, where=better)
+    time_s[~wanted] = np.nan
     return time_s

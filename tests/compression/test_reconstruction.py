@@ -18,6 +18,7 @@ from firmware.leader.reconstruction import (
     ReconstructionSettings,
     reconstruct_packets,
     reconstruct_points,
+    times_of_cells,
 )
 from firmware.submaps import Track
 from protocol.arithmetic import Decoder, Encoder
@@ -183,3 +184,18 @@ def test_damaged_bodies_give_a_grid_or_one_error(seed: int, changes: int, profil
     except EstimationError:
         return
     assert found.grid.depth_m.size <= 50_000
+
+
+def test_cells_are_timed_by_where_the_sonar_looked_though_the_track_drifts_aside() -> None:
+    times_s = np.arange(40.0)
+    lost = (times_s > 14.0) & (times_s < 19.0)  # a slice
+    track = Track(
+        time_s=times_s[~lost],
+        north_m=2.0 * times_s[~lost],
+        east_m=0.1 * times_s[~lost],
+        yaw_rad=np.zeros(np.count_nonzero(~lost)),
+    )
+    north_m, east_m = np.arange(10.0, 70.0, 2.0), np.arange(-60.0, 62.0, 2.0)
+    wanted = np.ones((north_m.size, east_m.size), dtype=bool)
+    found_s = times_of_cells(track, north_m, east_m, wanted)
+    assert np.abs(found_s - north_m[:, None] / 2.0).max() <= 0.5

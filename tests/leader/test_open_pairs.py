@@ -9,6 +9,7 @@ import pytest
 from firmware.leader.atlas import Atlas, Sheet, SheetId, sheet_of
 from firmware.leader.closure_settings import ClosureSettings
 from firmware.leader.closures import enter_hint
+from firmware.leader.displacement import Look
 from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.judgement import Judgement, JudgementSettings
 from firmware.leader.match_jobs import MatchJob, jobs_again
@@ -20,6 +21,15 @@ from firmware.submaps import GriddedSubmap, Track
 
 AMBIGUOUS = MatchOutcome(match=None, reason=NoMatch.AMBIGUOUS)
 UNSETTLED = MatchOutcome(match=None, reason=NoMatch.UNSETTLED)
+
+LOOK = Look(
+    vehicle=0,
+    starboard=np.array([0.0, 1.0]),
+    altitude_m=40.0,
+    half_width_m=70.0,
+    errors=np.zeros(2),
+    covariance=np.zeros((2, 2)),
+)
 
 
 def _sheet(submap: int, time_s: float = 0.0) -> Sheet:
@@ -52,6 +62,7 @@ def _job(origin: Sheet, target: Sheet, sigma_m: float) -> MatchJob:
         prior_shift_m=np.zeros(2),
         prior_covariance_m2=np.diag([1.0, sigma_m**2]),
         settings=MatchingSettings(),
+        looks=(LOOK, LOOK),
     )
 
 

@@ -1,0 +1,58 @@
+"""Roll and refraction move what a sonar sees aside; closures are told where it really lay."""
+
+import math
+
+import numpy as np
+import pytest
+
+from firmware.leader.displacement import Look, displaced
+
+ALTITUDE_M = 40.0
+HALF_WIDTH_M = ALTITUDE_M * math.tan(math.radians(60.0))
+ROLL_RAD, FASTER = math.radians(0.2), 2.0 / 1500.0  # sonar head, and sound against what is assumed
+STARBOARD = np.array([0.0, 1.0])
+
+
+def _seen_across_m(true_m: float) -> float:
+    """Return where a sonar sees a flat seabed that lies so far across its track."""
+    slant_m, angle = math.hypot(true_m, ALTITUDE_M), math.atan2(true_m, ALTITUDE_M)
+    steered = math.asin(math.sin(angle + ROLL_RAD) / (1.0 + FASTER))
+    return slant_m / (1.0 + FASTER) * math.sin(steered)
+
+
+def _look(starboard: np.ndarray, vehicle: int = 1, sigma: float = 1e-4) -> Look:
+    smile = FASTER * HALF_WIDTH_M / ALTITUDE_M
+    return Look(
+        vehicle=vehicle,
+        starboard=starboard,
+        altitude_m=ALTITUDE_M,
+        half_width_m=HALF_WIDTH_M,
+        errors=np.array([-ROLL_RAD, smile]),
+        covariance=sigma**2 * np.eye(2),
+    )
+
+
+@pytest.mark.parametrize("true_m", [10.0, 30.0, -30.0, -50.0])
+def test_lines_of_opposite_heading_are_as_far_apart_as_they_are(true_m: float) -> None:
+    seen_m = _seen_across_m(true_m)
+    levers = (seen_m * STARBOARD, -seen_m * STARBOARD)
+    added_m, _ = displaced((_look(STARBOARD), _look(-STARBOARD)), levers)
+    seemed_m = levers[0] - levers[1]
+    assert abs(seemed_m[1] - 2.0 * true_m) > 0.1
+    assert (seemed_m + added_m)[1] == pytest.approx(2.0 * true_m, abs=0.03)
+
+
+def test_one_vehicle_on_the_same_line_again_errs_alike() -> None:
+    look, lever_m = _look(STARBOARD), 30.0 * STARBOARD
+    added_m, left_m2 = displaced((look, look), (lever_m, lever_m))
+    assert added_m == pytest.approx(np.zeros(2))
+    assert left_m2 == pytest.approx(np.zeros((2, 2)))
+
+
+def test_what_is_not_known_of_two_sonars_adds_up() -> None:
+    lever_m, looks = 30.0 * STARBOARD, (_look(STARBOARD), _look(STARBOARD, vehicle=2))
+    _, left_m2 = displaced(looks, (lever_m, lever_m))
+    across = 30.0 / HALF_WIDTH_M
+    alone_m2 = (1e-4 * ALTITUDE_M) ** 2 * (1.0 + 4.0 * across**2)
+    assert left_m2[1, 1] == pytest.approx(2.0 * alone_m2)
+    assert left_m2[0, 0] == pytest.approx(0.0)

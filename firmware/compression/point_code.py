@@ -34,27 +34,30 @@ def encode_place_steps(
     places: Places, shape: tuple[int, int], encoder: Encoder
 ) -> Generator[None, None, NDArray[np.intp]]:
     """Code places (M, 2) within a box of rows and columns; the value is the order a reader gets."""
+    rows_columns = places.tolist()
     order: list[int] = []
-    open_boxes: list[tuple[Box, NDArray[np.intp]]] = [((0, 0, *shape), np.arange(len(places)))]
+    open_boxes: list[tuple[Box, list[int]]] = [((0, 0, *shape), list(range(len(places))))]
     while open_boxes:
         box, inside = open_boxes.pop()
-        if inside.size <= 1 or box[2:] == (1, 1):
-            if inside.size == 1:
-                _encode_alone(places[inside[0]], box, encoder)
-            order.extend(inside.tolist())
+        if len(inside) <= 1 or box[2:] == (1, 1):
+            if len(inside) == 1:
+                _encode_alone(rows_columns[inside[0]], box, encoder)
+            order += inside
             if len(order) % _POINTS_A_STEP == 0:
                 yield
             continue
         first, second, axis = _halves(box)
-        in_second = places[inside, axis] >= second[axis]
-        _encode_count(int(in_second.sum()), inside.size, _odds(inside.size, box, first), encoder)
-        open_boxes += [(second, inside[in_second]), (first, inside[~in_second])]
+        in_first = [i for i in inside if rows_columns[i][axis] < second[axis]]
+        in_second = [i for i in inside if rows_columns[i][axis] >= second[axis]]
+        odds = _odds(len(inside), box, first)
+        _encode_count(len(in_second), len(inside), odds, encoder)
+        open_boxes += [(second, in_second), (first, in_first)]
     return np.array(order, dtype=np.intp)
 
 
-def _encode_alone(place: Places, box: Box, encoder: Encoder) -> None:
+def _encode_alone(place: list[int], box: Box, encoder: Encoder) -> None:
     """Code where in a box its only point lies, as counts of one would, at a third of the time."""
-    row, column, rows, columns = int(place[0]) - box[0], int(place[1]) - box[1], box[2], box[3]
+    row, column, rows, columns = place[0] - box[0], place[1] - box[1], box[2], box[3]
     while rows > 1 or columns > 1:
         if rows >= columns:
             half, bit = rows // 2, int(row >= rows // 2)

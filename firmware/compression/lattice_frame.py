@@ -9,8 +9,9 @@ from firmware.geometry import Array
 from firmware.submaps import BinnedSoundings
 
 _MARGIN_NODES = 3  # beyond the cells on all sides; keeps the cosines' mirror off the data
-_MAX_NODES = 250  # along a side: one byte, and bounded work
+_MAX_NODES = 250  # along a side: one byte, bounded work, and a length that transforms fast
 _ANGLE_STEPS = 256  # of half a turn
+_LARGEST_FACTOR = 40  # of a side: beyond it a cosine transform takes far longer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,7 +59,10 @@ class LatticeFrame:
 
 
 def lattice_frame(bins: BinnedSoundings, step_m: float) -> LatticeFrame:
-    """Return the smallest frame along the cells' main axis, its step doubled until it fits."""
+    """Return the smallest frame along the cells' main axis, its step doubled until it fits.
+
+    A side is a node or two longer where its transform would be slow.
+    """
     position_m = np.column_stack([bins.north_m, bins.east_m])
     centred_m = position_m - position_m.mean(axis=0)
     axis = np.linalg.eigh(centred_m.T @ centred_m)[1][:, -1]
@@ -85,9 +89,21 @@ def lattice_frame(bins: BinnedSoundings, step_m: float) -> LatticeFrame:
         corner_east_q=int(corner_q[1]),
         angle_code=angle_code,
         step_q=step_q,
-        rows=int(sides[0]),
-        columns=int(sides[1]),
+        rows=_transforming_fast(int(sides[0])),
+        columns=_transforming_fast(int(sides[1])),
     )
+
+
+def _transforming_fast(side: int) -> int:
+    """Return the next length without a large prime factor: 149 costs eight times as much as 150."""
+    while True:
+        rest = side
+        for factor in range(2, _LARGEST_FACTOR + 1):
+            while rest % factor == 0:
+                rest //= factor
+        if rest == 1:
+            return side
+        side += 1
 
 
 def interpolation(frame: LatticeFrame, position_m: Array) -> csr_array:

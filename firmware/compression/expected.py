@@ -17,7 +17,6 @@ from firmware.compression.initial import main_axis
 from firmware.compression.kernel_rows import Float32, Room, Rows, change_by_points, moment_terms
 from firmware.compression.kernels import (
     Kernel,
-    correlation,
     correlation_and_slope,
     squared_distance,
     subtrahends,
@@ -29,7 +28,7 @@ from firmware.geometry import Array
 
 _STEP_WORK = 10240 * 150**2  # rows x points^2 of a step: under 10 ms
 _ROOM_ENTRIES = 192 * 150  # rows x points held at once: they stay in the cache
-_FEWEST_ROWS = 128  # for which it pays to add to the Gram matrix
+_FEWEST_ROWS = 192  # for which it pays to add to the Gram matrix
 _KEPT_BYTES = 4 << 20  # of kernel rows between two passes; beyond it they are made twice
 
 
@@ -116,11 +115,12 @@ class ExpectedError:
             if done % self._rows_a_step == 0:
                 yield
         yield
-        k = correlation(self._kernel, squared_distance(point_m, point_m, b))
+        k, slope = self._among_points(point_m, b)
         if self._lossy is None:
             found = weights_without_losses(gram, moment, k, self._ridge)
         else:
             found = yield from self._lossy.steps(gram, moment, k)
+        del gram  # the fit's largest, and used up
         self.failed_factorisations += found.failed_factorisations
         evaluation = Evaluation(
             error_m2=self.total_m2 + found.error_m2,
@@ -130,11 +130,11 @@ class ExpectedError:
         )
         if not gradient:
             return evaluation
-        del gram, k  # the fit's largest, and used up
+        del k
         yield
         moments = yield from self._moment_steps(found, points, b, parts)
         by_position, by_log_b = change_by_points(moments, point_m, b)
-        own = self._own_moments(found, point_m, b)
+        own = self._own_moments(found, slope, point_m)
         by_own_position, by_own_log_b = change_by_points(own, point_m, b)
         return dataclasses.replace(
             evaluation,
@@ -157,18 +157,28 @@ class ExpectedError:
                 yield
         return moments
 
-    def _own_moments(self, found: Weights, point_m: Array, b: float) -> Array:
+    def _among_points(self, point_m: Array, b: float) -> tuple[Float32, Float32]:
+        """Return the points' own correlation K (M, M) and its slope.
+
+        The rounding of float32 is a hundred times less than the nugget.
+        """
+        local_m, size = point_m.astype(np.float32), len(point_m)
+        k, slope = (np.empty((size, size), dtype=np.float32) for _ in range(2))
+        for start in range(0, size, self._height):
+            part = slice(start, start + self._height)
+            room = self._room.shaped(len(local_m[part]), size)
+            squared = squared_distance(local_m[part], local_m, b, room.k, room.slope)
+            k[part], slope[part] = correlation_and_slope(self._kernel, squared, room.k, room.slope)
+        return k, slope
+
+    def _own_moments(self, found: Weights, slope: Float32, point_m: Array) -> Array:
         """Return the moments (M, 4) of the points' pull on each other through their own K."""
-        local_m, terms = point_m.astype(np.float32), moment_terms(point_m)
+        terms = moment_terms(point_m)
+        if not found.by_k.size:
+            pull = (self._ridge * found.beta[:, None] * terms).astype(np.float32)
+            return np.asarray((slope @ pull) * (2.0 * found.beta[:, None]), dtype=np.float64)
         moments = np.empty_like(terms)
         for start in range(0, len(point_m), self._height):
             part = slice(start, start + self._height)
-            room = self._room.shaped(len(point_m[part]), len(point_m))
-            squared = squared_distance(local_m[part], local_m, b, room.k, room.slope)
-            slope = correlation_and_slope(self._kernel, squared, room.k, room.slope)[1]
-            if found.by_k.size:
-                moments[part] = (slope * (found.by_k[part] + found.by_k[:, part].T)) @ terms
-            else:
-                pull = (self._ridge * found.beta[:, None] * terms).astype(np.float32)
-                moments[part] = (slope @ pull) * (2.0 * found.beta[part, None])
+            moments[part] = (slope[part] * (found.by_k[part] + found.by_k[:, part].T)) @ terms
         return moments

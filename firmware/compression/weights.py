@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_solve, solve_triangular
 
 from firmware.compression.decoder import NUGGET, factorised
+from firmware.compression.kernels import FloatArray
 from firmware.compression.losses import LossPatterns
 from firmware.geometry import Array
 
@@ -38,7 +39,7 @@ class Weights:
     by_k: Array = field(default_factory=lambda: np.empty((0, 0)))
 
 
-def weights_without_losses(gram: Array, moment: Array, k: Array, ridge: float) -> Weights:
+def weights_without_losses(gram: Array, moment: Array, k: FloatArray, ridge: float) -> Weights:
     """Return the weights of least error when every point arrives; gram is used up.
 
     k gets its nugget.
@@ -65,7 +66,7 @@ class LossyWeights:
         self._groups = _groups(patterns, fragment)
         self._ridge = ridge
 
-    def steps(self, gram: Array, moment: Array, k: Array) -> Generator[None, None, Weights]:
+    def steps(self, gram: Array, moment: Array, k: FloatArray) -> Generator[None, None, Weights]:
         """Find them in small steps; the value is the weights. k gets its nugget.
 
         The points' own K enters through Q, that is through the corrections of the weights.

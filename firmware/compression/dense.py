@@ -53,7 +53,6 @@ _REACH_SHARE = 0.75  # of the kernel's: twenty evaluations do not find what more
 _PLACES_A_SPACING = 8.0  # steps: coarser costs error, finer bits
 _DEPTHS_AN_ERROR = 4.0  # steps of depth in the map's expected error
 _PLACE_EXPONENT, _DEPTH_EXPONENT = 8, 16  # steps are 2^(code - exponent) m
-_PACK_EVERY = 10  # evaluations: coding costs as much as four, and half-way is worth sending
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,6 +64,23 @@ class DenseCode:
     hyperparameters: NDArray[np.float32]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DenseDraft:
+    """Points on their way to a better fit, not coded yet: coding costs as much as four evaluations.
+
+    It is done in small steps for the last of them, and at once for those of a fit cut short.
+    """
+
+    fitted: FittedPoints
+    frame: FitFrame
+    bins: BinnedSoundings
+    room: int
+
+    def code_steps(self) -> Generator[None, None, DenseCode]:
+        """Code the points in small steps; the generator's value is the code."""
+        return _coded_steps(self.fitted, self.frame, self.bins, self.room)
+
+
 def frames_relied_on(frames: int, loss: float) -> int:
     """Return how many of the frames nearly always arrive, at least half of them."""
     half = (frames + 1) // 2
@@ -74,10 +90,10 @@ def frames_relied_on(frames: int, loss: float) -> int:
 
 def dense_code_steps(
     bins: BinnedSoundings, settings: CompressionSettings, size: int
-) -> Generator[tuple[DenseCode, FittedPoints] | None, None, str]:
-    """Yield ever better codes, and None between small steps; the value says why it ended.
+) -> Generator[tuple[DenseCode | DenseDraft, FittedPoints] | None, None, str]:
+    """Yield ever better drafts, at last a code, and None between small steps.
 
-    size is that of a frame's body.
+    size is that of a frame's body; the value says why it ended.
     """
     relied_on = frames_relied_on(settings.frames, settings.expected_loss)
     room = relied_on * (size - PROTECTION_BYTES - _TRACK_BYTES)
@@ -94,23 +110,21 @@ def dense_code_steps(
         return Dealing(fragment=fragment, patterns=loss_patterns(0.0, settings.frames))
 
     steps = fit_steps(placing, count, settings, deal, settings.dense_iterations, _REACH_SHARE)
-    waiting: FittedPoints | None = None
-    packed_at = 0
+    draft: DenseDraft | None = None
     while True:
         try:
             step = next(steps)
         except StopIteration as stop:
             ended = str(stop.value)
             break
-        waiting = step or waiting
-        yield None
-        if step is not None and (not packed_at or step.evaluations >= packed_at + _PACK_EVERY):
-            packed_at, waiting = step.evaluations, None
-            code = yield from _coded_steps(step, frame, bins, room)
-            yield code, step
-    if waiting is not None:
-        code = yield from _coded_steps(waiting, frame, bins, room)
-        yield code, waiting
+        if step is None:
+            yield None
+            continue
+        draft = DenseDraft(fitted=step, frame=frame, bins=bins, room=room)
+        yield draft, step
+    if draft is not None:
+        code = yield from draft.code_steps()
+        yield code, draft.fitted
     return ended
 
 

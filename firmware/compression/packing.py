@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware.compression.dense import DenseCode, dense_bodies
+from firmware.compression.dense import DenseCode, DenseDraft, dense_bodies
 from firmware.compression.lattice import lattice_bodies
 from firmware.compression.results import (
     PAPER_FRAGMENTS,
@@ -14,8 +14,10 @@ from firmware.compression.results import (
     fragment_points,
 )
 from firmware.compression.settings import CompressionSettings
+from firmware.compression.steps import run
 from firmware.compression.track_code import encode_track
 from firmware.submaps import Track
+from protocol.errors import EstimationError, LocalProtocolError
 from protocol.packets import (
     BODY_BYTES,
     STATES_PER_FRAGMENT,
@@ -84,9 +86,19 @@ def filled_bytes(profile: Profile, settings: CompressionSettings) -> int:
 def _bodies(compressed: CompressedCode, track: bytes) -> list[bytes]:
     settings, frames = compressed.settings, compressed.fragment_count
     size = filled_bytes(compressed.profile, settings)
-    if isinstance(compressed.code, DenseCode):
-        return dense_bodies(compressed.code, track, size, frames)
-    return lattice_bodies(compressed.code, track, size, frames, settings)
+    code = compressed.code
+    if isinstance(code, DenseDraft):
+        code = _coded(code)
+    if isinstance(code, DenseCode):
+        return dense_bodies(code, track, size, frames)
+    return lattice_bodies(code, track, size, frames, settings)
+
+
+def _coded(draft: DenseDraft) -> DenseCode:
+    try:
+        return run(draft.code_steps())
+    except EstimationError as error:
+        raise LocalProtocolError(f"a fit cut short cannot be coded: {error}") from error
 
 
 def _fragments(

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware.compression.dense import DenseCode
+from firmware.compression.dense import DenseCode, DenseDraft
 from firmware.compression.lattice import LatticeCode
 from firmware.compression.settings import CompressionSettings
 from protocol.errors import LocalProtocolError
@@ -50,7 +50,7 @@ class CompressedCode:
 
     profile: Profile
     fragment_count: int
-    code: LatticeCode | DenseCode
+    code: LatticeCode | DenseCode | DenseDraft
     settings: CompressionSettings
     report: FitReport
 

@@ -11,7 +11,7 @@ from firmware.compression import Compressed, CompressedCode, compress, packets_f
 from firmware.compression.binning import SoundingBins
 from firmware.compression.decoder import factorised
 from firmware.compression.dense import DenseCode, dense_bodies
-from firmware.compression.lattice import lattice_bodies
+from firmware.compression.lattice import LatticeCode, lattice_bodies
 from firmware.compression.packing import submap_header
 from firmware.compression.settings import CompressionSettings
 from firmware.compression.track_code import encode_track
@@ -166,7 +166,7 @@ def test_absurd_hyperparameters_of_dense_give_a_bounded_grid_or_one_error(
 def test_absurd_geometry_of_lattice_gives_a_bounded_grid_or_one_error(
     value: int, place: int, survey: Survey, lattice: CompressedCode
 ) -> None:
-    assert not isinstance(lattice.code, DenseCode)
+    assert isinstance(lattice.code, LatticeCode)
     bodies = lattice_bodies(lattice.code, track_of(survey), 244, 1, lattice.settings)
     body = bytearray(bodies[0])
     body[4 + len(track_of(survey)) + place] = value

@@ -143,7 +143,7 @@ def _coded_steps(
     order = yield from encode_place_steps(places, shape, encoder)
     order = order[coarse_to_fine(len(order))]
     position_m = (places + corner) * step_m
-    fitted = yield from moved_steps(fitted, position_m - frame.origin_m, frame)
+    fitted = yield from moved_steps(fitted, position_m - frame.origin_m, frame, _REACH_SHARE)
     position_m, depth_m = position_m[order], fitted.depth_m[order]
     hyper = Hyperparameters(
         b_per_m=fitted.b_per_m,

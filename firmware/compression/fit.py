@@ -206,7 +206,7 @@ def fit_steps(
 
 
 def moved_steps(
-    fitted: FittedPoints, position_m: Array, frame: FitFrame
+    fitted: FittedPoints, position_m: Array, frame: FitFrame, reach_share: float = 1.0
 ) -> Generator[None, None, FittedPoints]:
     """Move the points to positions (M, 2); the generator's value has the best depths there."""
     problem = ExpectedError(
@@ -218,6 +218,7 @@ def moved_steps(
         fitted.fragment,
         frame.ridge,
         keep_rows=False,
+        reach_share=reach_share,
     )
     log_b = float(np.log(fitted.b_per_m))
     result = yield from problem.steps(position_m, log_b, gradient=False)

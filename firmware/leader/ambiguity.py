@@ -178,6 +178,32 @@ def posterior(surface: ErrorSurface, evidence: Array, prior: Prior, null_share: 
     )
 
 
+def strayed_m2(
+    surface: ErrorSurface, limit: float, prior: Prior, winner_m: Array, axis: Array
+) -> float:
+    """Return the mean square by which a ridge leaves the line through the winner, across the axis.
+
+    Contours of the seabed bend: a closure that slides along one holds at the winner, but the line
+    goes on to where the prior expects the shift. Of the shifts abreast of each other the best
+    stands for the ridge if its misfit is within the limit; the prior says how much it counts.
+    """
+    misfit = surface.residual_m2 / surface.noise_m2
+    row, column = np.nonzero(np.isfinite(misfit) & (misfit <= limit))
+    if row.size == 0:
+        return 0.0
+    cell_m = float(surface.north_m[1] - surface.north_m[0])
+    shifts_m = np.stack([surface.north_m[row], surface.east_m[column]])
+    from_winner_m = shifts_m - winner_m[:, None]
+    abreast = np.round(np.array([-axis[1], axis[0]]) @ from_winner_m / cell_m)
+    order = np.lexsort((misfit[row, column], abreast))
+    ridge = order[np.unique(abreast[order], return_index=True)[1]]
+    away_m = shifts_m[:, ridge] - prior.mean_m[:, None]
+    square = np.sum(away_m * np.linalg.solve(prior.covariance_m2, away_m), axis=0)
+    weight = np.exp(-0.5 * (square - square.min()))
+    strayed = float(np.average((axis @ from_winner_m[:, ridge]) ** 2, weights=weight))
+    return max(strayed - cell_m**2 / 6.0, 0.0)  # which the lattice itself makes
+
+
 def judge(found: Posterior, winner_m: Array, radius_m: float) -> Verdict:
     """Return the mass outside the winner's basin, and outside the line through it."""
     north, east = found.north_m - winner_m[0], found.east_m - winner_m[1]

@@ -157,10 +157,14 @@ class Estimate:
 
         Raises EstimationError if the information matrix is singular.
         """
-        keys = list(dict.fromkeys(anchor.key for anchor in anchors))
-        row = {key: 2 * k for k, key in enumerate(keys)}
-        rows = [row[anchor.key] + axis for anchor in anchors for axis in (0, 1)]
-        return np.asarray(self._joint_covariance(keys)[np.ix_(rows, rows)])
+        return self._of_anchors(anchors, _POSITION)
+
+    def drift_covariance(self, anchors: list[Anchor]) -> Array:
+        """Return the joint covariance (2A, 2A) in (m/s)^2 of the drift at A anchors.
+
+        Raises EstimationError if the information matrix is singular.
+        """
+        return self._of_anchors(anchors, _BIAS)
 
     def predicted_covariance(self, vehicle: int, time_s: float) -> Array:
         """Return the covariance (2, 2) in m^2 of a vehicle's position at or after its last node."""
@@ -236,6 +240,12 @@ class Estimate:
             for key in (*chain.keys, chain.parameters, chain.clock)
             if key is not None
         }
+
+    def _of_anchors(self, anchors: list[Anchor], part: slice) -> Array:
+        keys = list(dict.fromkeys(anchor.key for anchor in anchors))
+        row = {key: 2 * k for k, key in enumerate(keys)}
+        rows = [row[anchor.key] + axis for anchor in anchors for axis in (0, 1)]
+        return np.asarray(self._joint_covariance(keys, part)[np.ix_(rows, rows)])
 
     def _joint_covariance(
         self, keys: list[int], part: slice = _POSITION, *, reckoned: bool = False

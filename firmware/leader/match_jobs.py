@@ -184,7 +184,7 @@ def _jobs(
             target_drift_mps=target.drift_mps,
             prior_shift_m=offset.shift_m,
             prior_covariance_m2=offset.covariance_m2,
-            settings=calibrations.matching_of(origin, target, offset.shift_m),
+            settings=calibrations.matching_of(origin, target, offset.shift_m, offset.drift_m2ps2),
             looks=(calibrations.look_of(origin), calibrations.look_of(target)),
         )
         for origin, offset in pairs

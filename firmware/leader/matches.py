@@ -62,6 +62,12 @@ class MatchingSettings(Settings):
     position_sigma_m: float = setting(
         0.5, "m", "heading noise and wandering inside a sub-map, felt on slopes", minimum=0.0
     )
+    strain_sigma_m: float = setting(
+        0.0,
+        "m",
+        "between cells of two sub-maps, by drift within them that is not known yet",
+        minimum=0.0,
+    )
     finest_wave_m: float = setting(
         17.0, "m", "twice the spacing of 150 pseudo points on a sub-map", minimum=0.1
     )

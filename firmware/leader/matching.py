@@ -104,7 +104,8 @@ def _search(
     scores = [value + c.log_prior for c, value in zip(candidates, refined, strict=True)]
     best = int(np.argmax(scores))
     found = ambiguity.posterior(surface, evidence, prior, null_share)
-    return _decide(candidates[best], refined[best], found, prior, problem)
+    ridge = surface, scale
+    return _decide(candidates[best], refined[best], found, prior, problem, ridge)
 
 
 def _evidence(surface: ErrorSurface, relief: ambiguity.Relief) -> Array:
@@ -203,8 +204,11 @@ def _decide(
     found: ambiguity.Posterior,
     prior: Prior,
     problem: PairProblem,
+    ridge: tuple[ErrorSurface, float],
 ) -> MatchOutcome:
     """Return the winner as a closure in the plane or along one axis, or the gate it failed.
+
+    ridge is the screened surface, and the misfit up to which a shift of it fits.
 
     Mass that is certain where neither the slopes nor the prior can be is a contradiction: chance
     has chosen among repetitions of a pattern.
@@ -235,6 +239,7 @@ def _decide(
     else:
         return _none(NoMatch.AMBIGUOUS)
     along = float(axis @ covariance @ axis)
+    along += ambiguity.strayed_m2(*ridge, prior, refined.shift_m, axis)
     if along > settings.sigma_limit_m**2:
         return _none(NoMatch.LOOSE)
     across = np.array([-axis[1], axis[0]])

@@ -17,12 +17,14 @@ class Offset:
     """How a sheet lies to another one, the origin.
 
     shift_m (2,) is to be added to what dead reckoning says, each sheet's at its own time;
-    covariance_m2 (2, 2) is that of the offset.
+    covariance_m2 (2, 2) is that of the offset, drift_m2ps2 (4, 4) that of the drifts, origin's
+    first.
     """
 
     origin: Sheet
     shift_m: Array
     covariance_m2: Array
+    drift_m2ps2: Array
 
     def without(self, told_m: Array, told_m2: Array) -> "Offset":
         """Return the offset with one of the Gaussian factors that it rests on taken out."""
@@ -47,14 +49,16 @@ def offsets_of(sheet: Sheet, others: list[Sheet], estimate: Estimate) -> list[Of
             anchors.append(anchor_of(other, estimate))
             placed.append(other)
     joint_m2 = estimate.covariance(anchors).reshape(len(anchors), 2, len(anchors), 2)
+    drifts_m2ps2 = estimate.drift_covariance(anchors)
     own_m, found = correction_of(sheet, estimate), []
     for k, other in enumerate(placed, start=1):
-        cross_m2 = joint_m2[0, :, k]
+        cross_m2, pair = joint_m2[0, :, k], [2 * k, 2 * k + 1, 0, 1]
         found.append(
             Offset(
                 origin=other,
                 shift_m=own_m - correction_of(other, estimate),
                 covariance_m2=joint_m2[0, :, 0] + joint_m2[k, :, k] - cross_m2 - cross_m2.T,
+                drift_m2ps2=drifts_m2ps2[np.ix_(pair, pair)],
             )
         )
     return found

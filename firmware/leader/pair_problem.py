@@ -1,5 +1,6 @@
 """Two sub-maps made ready for matching: layers, noise and spectra."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,6 +43,7 @@ class PairProblem:
     spectra: tuple[Spectrum, Spectrum]
     white_m2: float
     shared_m2: float
+    slope2: float
 
     def surface(self) -> ErrorSurface:
         """Return E at every lattice shift."""
@@ -64,15 +66,25 @@ class PairProblem:
         area = 2.0 * np.pi * (self.settings.correlation_m / self.query.grid.cell_m) ** 2
         return float(_RESAMPLED_CELLS * (1.0 + 0.5 * self.noise.correlated_share * area))
 
-    def information(self, noise_scale: float) -> float:
-        """Return the information per cell of the layer that has less of it."""
+    def strained(self, surface: ErrorSurface) -> ErrorSurface:
+        """Return a surface of which noise also explains what drift inside the sub-maps does."""
+        strained_m2 = self.settings.strain_sigma_m**2 * self.slope2
+        return dataclasses.replace(surface, noise_m2=surface.noise_m2 + strained_m2)
+
+    def information(
+        self, noise_scale: float, *, strain_m: float = 0.0, longest_m: float = np.inf
+    ) -> float:
+        """Return the information per cell of the layer that has less of it.
+
+        Longer waves than given do not count, and strain blurs the short ones.
+        """
         noise = WaveNoise(
             white_m2=self.white_m2 * noise_scale,
             shared_m2=self.shared_m2 * noise_scale,
             correlation_m=self.settings.correlation_m,
-            position_sigma_m=self.settings.position_sigma_m,
+            position_sigma_m=float(np.hypot(self.settings.position_sigma_m, strain_m)),
         )
-        return min(information_per_cell(relief, noise) for relief in self.spectra)
+        return min(information_per_cell(relief, noise, longest_m) for relief in self.spectra)
 
 
 def pair_problem(
@@ -124,6 +136,7 @@ def pair_problem(
         spectra=spectra,
         white_m2=noise_m2 - shared_m2,
         shared_m2=shared_m2,
+        slope2=slope2,
     )
 
 

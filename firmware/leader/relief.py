@@ -62,14 +62,17 @@ def spectrum(layer: Layer) -> Spectrum:
     return Spectrum(power_m2=power, wave=wave, total_cells=rows * cols, cell_m=cell_m)
 
 
-def information_per_cell(relief: Spectrum, noise: WaveNoise) -> float:
-    """Return the log evidence per cell that the relief offers to a perfect match."""
+def information_per_cell(relief: Spectrum, noise: WaveNoise, longest_m: float = np.inf) -> float:
+    """Return the log evidence per cell that the relief offers to a perfect match.
+
+    Waves longer than `longest_m` are left out.
+    """
     length_m, power = noise.correlation_m, relief.power_m2
     area = 2.0 * np.pi * (length_m / relief.cell_m) ** 2
     total = noise.white_m2 + noise.shared_m2 * area * np.exp(-0.5 * (relief.wave * length_m) ** 2)
     total = total + (noise.position_sigma_m * relief.wave) ** 2 * power
     gain = 0.5 * np.log(np.maximum(power / np.maximum(total, 1e-12), 1.0))
-    return relief.mean(gain)
+    return relief.mean(np.where(relief.wave > 2.0 * np.pi / longest_m, gain, 0.0))
 
 
 def fine_relief_m2(relief: Spectrum, shortest_m: float) -> float:

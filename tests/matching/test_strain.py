@@ -1,0 +1,106 @@
+"""Drift that is not known yet strains sub-maps: pairs are told by how much, and so are hints."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from firmware.leader.ambiguity import Prior, strayed_m2
+from firmware.leader.atlas import SheetId, sheet_of
+from firmware.leader.matching import MatchingSettings, match
+from firmware.leader.pairing import Side, side_of, strain_m
+from firmware.leader.screening import ErrorSurface
+from firmware.leader.trajectory import Trajectory
+from firmware.submaps import GriddedSubmap, Track
+from tests.matching.scenes import Scene
+
+DRIFT_MPS = 0.1
+AGE_S = 39.0 / np.sqrt(12.0)
+STILL = MatchingSettings(walk_m2_per_s=0.0, drift_sigma_mps=0.0, position_sigma_m=0.1)
+CROSS_M = 2.0 * np.arange(-30, 31)
+
+
+def _side(heading_rad: float) -> Side:
+    times_s = np.arange(40.0)
+    along_m = 2.0 * (times_s - 20.0)
+    track = Track(
+        time_s=times_s,
+        north_m=along_m * np.cos(heading_rad),
+        east_m=along_m * np.sin(heading_rad),
+        yaw_rad=np.full(40, heading_rad),
+    )
+    shape = (40, 40)
+    grid = GriddedSubmap(
+        north0_m=-40.0,
+        east0_m=-40.0,
+        cell_m=2.0,
+        depth_m=np.full(shape, 40.0),
+        variance_m2=np.full(shape, 0.01),
+        time_s=np.full(shape, 20.0),
+    )
+    sheet_id = SheetId(vehicle=0, boot_epoch=0, submap=0)
+    sheet = sheet_of(sheet_id, track, grid, reconstructed=False)
+    assert sheet is not None
+    still = Trajectory(
+        time_s=np.array([0.0, 40.0]),
+        reckoned_m=np.zeros((2, 2)),
+        position_m=np.zeros((2, 2)),
+        bias_mps=np.zeros((2, 2)),
+    )
+    return side_of(sheet, still)
+
+
+@pytest.mark.parametrize(
+    ("heading_rad", "apart_s"), [(0.0, 0.0), (np.pi, 2.0 * AGE_S), (np.pi / 2, np.sqrt(2) * AGE_S)]
+)
+def test_one_unknown_drift_strains_lines_of_opposite_heading_most(
+    heading_rad: float, apart_s: float
+) -> None:
+    same = DRIFT_MPS**2 * np.tile(np.eye(2), (2, 2))  # one vehicle's, the same on both lines
+    apart_m, sigma_mps = strain_m(_side(0.0), _side(heading_rad), same)
+    assert apart_m == pytest.approx(DRIFT_MPS * apart_s, abs=1e-6)
+    assert sigma_mps == pytest.approx(DRIFT_MPS)
+
+
+def _hints(scenes: list[Scene], prior_m: float, strain_sigma_m: float = 0.0) -> int:
+    """Return how many scenes leave a hint of the shift between two sub-maps."""
+    settings = replace(STILL, strain_sigma_m=strain_sigma_m)
+    hints = 0
+    for scene in scenes:
+        sides = [scene.submap(200, east_m, (31, 60)) for east_m in (100, 160)]
+        found = match(sides[0], sides[1], np.zeros(2), prior_m**2 * np.eye(2), settings)
+        hints += found.hint is not None
+    return hints
+
+
+def test_waves_longer_than_the_prior_leaves_open_confirm_nothing() -> None:
+    scenes = [Scene(seed) for seed in range(10)]
+    for scene in scenes:
+        swell = ndimage.gaussian_filter(scene.rng.standard_normal((400, 400)), 25.0)
+        scene.depth_m = 0.1 * swell / swell.std()
+    assert _hints(scenes, prior_m=60.0) > 0
+    assert _hints(scenes, prior_m=8.0) == 0
+
+
+def test_what_strain_may_have_done_is_no_evidence() -> None:
+    scenes = [Scene(seed, rms_m=0.035) for seed in range(10)]
+    assert _hints(scenes, prior_m=20.0) > 0
+    assert _hints(scenes, prior_m=20.0, strain_sigma_m=30.0) == 0
+
+
+@pytest.mark.parametrize(("bend_per_m", "strays"), [(0.0, False), (0.01, True)])
+def test_one_axis_closure_knows_how_its_contour_bends(bend_per_m: float, *, strays: bool) -> None:
+    off_m = CROSS_M[:, None] - bend_per_m * CROSS_M[None, :] ** 2
+    surface = ErrorSurface(
+        north_m=CROSS_M,
+        east_m=CROSS_M,
+        overlap_cells=np.full(off_m.shape, 500.0),
+        residual_m2=0.01 * (0.5 + off_m**2 / 4.0),
+        noise_m2=np.full(off_m.shape, 0.01),
+        depth_offset_m=np.zeros(off_m.shape),
+    )
+    prior = Prior(np.array([0.0, 10.0]), 225.0 * np.eye(2))
+    found_m2 = strayed_m2(surface, 1.0, prior, np.zeros(2), np.array([1.0, 0.0]))
+    assert (found_m2 > 4.0) is strays
+    assert strays or found_m2 == 0.0

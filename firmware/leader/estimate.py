@@ -157,14 +157,22 @@ class Estimate:
 
         Raises EstimationError if the information matrix is singular.
         """
-        return self._of_anchors(anchors, _POSITION)
+        keys = list(dict.fromkeys(anchor.key for anchor in anchors))
+        row = {key: 2 * k for k, key in enumerate(keys)}
+        rows = [row[anchor.key] + axis for anchor in anchors for axis in (0, 1)]
+        return np.asarray(self._joint_covariance(keys)[np.ix_(rows, rows)])
 
-    def drift_covariance(self, anchors: list[Anchor]) -> Array:
-        """Return the joint covariance (2A, 2A) in (m/s)^2 of the drift at A anchors.
+    def state_covariance(self, anchors: list[Anchor]) -> Array:
+        """Return the joint covariance (A, 4, A, 4) of positions in m and drifts in m/s of anchors.
 
         Raises EstimationError if the information matrix is singular.
         """
-        return self._of_anchors(anchors, _BIAS)
+        keys = list(dict.fromkeys(anchor.key for anchor in anchors))
+        node = {key: k for k, key in enumerate(keys)}
+        nodes = [node[anchor.key] for anchor in anchors]
+        self.update()
+        joint = self._solver.covariance(keys).reshape(len(keys), 4, len(keys), 4)
+        return np.asarray(joint[nodes][:, :, nodes])
 
     def predicted_covariance(self, vehicle: int, time_s: float) -> Array:
         """Return the covariance (2, 2) in m^2 of a vehicle's position at or after its last node."""
@@ -240,12 +248,6 @@ class Estimate:
             for key in (*chain.keys, chain.parameters, chain.clock)
             if key is not None
         }
-
-    def _of_anchors(self, anchors: list[Anchor], part: slice) -> Array:
-        keys = list(dict.fromkeys(anchor.key for anchor in anchors))
-        row = {key: 2 * k for k, key in enumerate(keys)}
-        rows = [row[anchor.key] + axis for anchor in anchors for axis in (0, 1)]
-        return np.asarray(self._joint_covariance(keys, part)[np.ix_(rows, rows)])
 
     def _joint_covariance(
         self, keys: list[int], part: slice = _POSITION, *, reckoned: bool = False

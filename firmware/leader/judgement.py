@@ -168,7 +168,7 @@ class Judgement:
             side_of(sheet, trajectory)
             for sheet, trajectory in zip(neighbours, trajectories, strict=True)
         )
-        matching = self._calibrations.matching_of(reference, query, shift_m, np.zeros((4, 4)))
+        matching = self._calibrations.matching_of(reference, query, shift_m)
         ages_s = (
             neighbours[0].time_s - closure.origin_anchor.time_s,
             neighbours[1].time_s - closure.target_anchor.time_s,

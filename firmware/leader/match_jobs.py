@@ -1,5 +1,6 @@
 """Which pairs of sub-maps are worth a match, and all that each of these matches needs."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,10 +9,11 @@ from firmware.geometry import Array
 from firmware.leader.atlas import Atlas, Sheet, overlap_m2
 from firmware.leader.closure_settings import ClosureSettings
 from firmware.leader.displacement import Look
+from firmware.leader.drifts import NO_DRIFT, UNRESOLVED_M, Drifts
 from firmware.leader.estimate import Estimate
 from firmware.leader.matching import MatchingSettings, MatchOutcome, match
 from firmware.leader.offsets import Offset, correction_of, corrections, offsets_of
-from firmware.leader.pairing import Calibrations, side_of
+from firmware.leader.pairing import Calibrations, Side, side_of, strain_m
 from firmware.submaps import GriddedSubmap
 
 
@@ -29,6 +31,7 @@ class MatchJob:
     prior_covariance_m2: Array
     settings: MatchingSettings
     looks: tuple[Look, Look]
+    drifts: Drifts = NO_DRIFT
 
     @property
     def prior_sigma_m(self) -> float:
@@ -45,6 +48,7 @@ class MatchJob:
             self.settings,
             reference_reconstructed=self.origin.reconstructed,
             query_reconstructed=self.target.reconstructed,
+            drifts=self.drifts,
         )
 
 
@@ -184,8 +188,26 @@ def _jobs(
             target_drift_mps=target.drift_mps,
             prior_shift_m=offset.shift_m,
             prior_covariance_m2=offset.covariance_m2,
-            settings=calibrations.matching_of(origin, target, offset.shift_m, offset.drift_m2ps2),
+            settings=_strained(
+                calibrations.matching_of(origin, target, offset.shift_m), origin, target, offset
+            ),
+            drifts=offset.drifts,
             looks=(calibrations.look_of(origin), calibrations.look_of(target)),
         )
         for origin, offset in pairs
     ]
+
+
+def _strained(
+    settings: MatchingSettings, origin: Side, target: Side, offset: Offset
+) -> MatchingSettings:
+    """Return the settings of a pair with what is not known of its drifts."""
+    drifts = offset.drifts.covariance(offset.covariance_m2)
+    told_m2 = offset.drifts.gain @ offset.covariance_m2 @ offset.drifts.gain.T
+    unresolved_m = min(strain_m(origin, target, told_m2), UNRESOLVED_M)
+    worst_mps = np.sqrt(max(np.trace(drifts[:2, :2]), np.trace(drifts[2:, 2:])) / 2.0)
+    return dataclasses.replace(
+        settings,
+        strain_sigma_m=float(np.hypot(strain_m(origin, target, offset.drifts.left), unresolved_m)),
+        drift_sigma_mps=float(np.hypot(settings.drift_sigma_mps, worst_mps)),
+    )

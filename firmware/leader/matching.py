@@ -9,6 +9,7 @@ from firmware.leader import ambiguity
 from firmware.leader.alignment import Aligned, fields_of
 from firmware.leader.ambiguity import Prior
 from firmware.leader.covariance import Refined, measure
+from firmware.leader.drifts import NO_DRIFT, Drifts, screened_by_drift
 from firmware.leader.hinting import hint_of
 from firmware.leader.matches import Hint, Match, MatchingSettings, MatchOutcome, NoMatch
 from firmware.leader.pair_problem import PairProblem, pair_problem, relief_of
@@ -43,13 +44,15 @@ def match(
     reference_reconstructed: bool = False,
     query_reconstructed: bool = False,
     times_s: tuple[float | None, float | None] = (None, None),
+    drifts: Drifts = NO_DRIFT,
 ) -> MatchOutcome:
     """Return the shift between two overlapping sub-maps, or why it cannot be known.
 
     E of Eq. (8) (Eq. (10) when a side is reconstructed) is screened at every lattice shift of the
     window that the prior implies, the best minima are refined below the cell, and the winner has
     to pass the threshold, carry evidence against unrelated seabed and leave little posterior mass
-    elsewhere. times_s are the instants of reference and query to which the shift shall refer.
+    elsewhere. times_s are the instants of reference and query to which the shift shall refer. A
+    pair that fails leaves a hint, for which every shift is judged with the drifts that it implies.
 
     Raises
     ------
@@ -74,9 +77,12 @@ def match(
     if relief is None:
         return _none(NoMatch.FEATURELESS)
     outcome = _search(problem, surface, relief, prior, times_s)
-    if outcome.match is None:
-        return replace(outcome, hint=hint_of(problem, surface, relief, prior))
-    return outcome
+    if outcome.match is not None:
+        return outcome
+    by_drift = screened_by_drift(problem, (reference, query), drifts, prior)
+    if by_drift is not None:
+        surface = _window(by_drift, prior, problem) or surface
+    return replace(outcome, hint=hint_of(problem, surface, relief, prior))
 
 
 def _search(

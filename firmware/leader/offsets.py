@@ -7,9 +7,14 @@ import numpy as np
 
 from firmware.geometry import Array
 from firmware.leader.atlas import Sheet
+from firmware.leader.drifts import Drifts
 from firmware.leader.estimate import Estimate
 from firmware.leader.ledger import Anchor
 from protocol.errors import EstimationError
+
+_BETWEEN = np.hstack([-np.eye(2, 4), np.eye(2, 4)])  # takes two states to their offset
+_DRIFTS = np.eye(8)[[2, 3, 6, 7]]  # and to their drifts
+_TINY_M2 = 1e-6  # two sub-maps of one node have no offset
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -17,14 +22,13 @@ class Offset:
     """How a sheet lies to another one, the origin.
 
     shift_m (2,) is to be added to what dead reckoning says, each sheet's at its own time;
-    covariance_m2 (2, 2) is that of the offset, drift_m2ps2 (4, 4) that of the drifts, origin's
-    first.
+    covariance_m2 (2, 2) is that of the offset. drifts belong to both, the origin's first.
     """
 
     origin: Sheet
     shift_m: Array
     covariance_m2: Array
-    drift_m2ps2: Array
+    drifts: Drifts
 
     def without(self, told_m: Array, told_m2: Array) -> "Offset":
         """Return the offset with one of the Gaussian factors that it rests on taken out."""
@@ -48,17 +52,21 @@ def offsets_of(sheet: Sheet, others: list[Sheet], estimate: Estimate) -> list[Of
         with contextlib.suppress(EstimationError):
             anchors.append(anchor_of(other, estimate))
             placed.append(other)
-    joint_m2 = estimate.covariance(anchors).reshape(len(anchors), 2, len(anchors), 2)
-    drifts_m2ps2 = estimate.drift_covariance(anchors)
+    joint = estimate.state_covariance(anchors)
     own_m, found = correction_of(sheet, estimate), []
     for k, other in enumerate(placed, start=1):
-        cross_m2, pair = joint_m2[0, :, k], [2 * k, 2 * k + 1, 0, 1]
+        ends = joint[[k, 0]][:, :, [k, 0]].reshape(8, 8)
+        covariance_m2 = _BETWEEN @ ends @ _BETWEEN.T
+        gain = _DRIFTS @ ends @ _BETWEEN.T @ np.linalg.inv(covariance_m2 + _TINY_M2 * np.eye(2))
         found.append(
             Offset(
                 origin=other,
                 shift_m=own_m - correction_of(other, estimate),
-                covariance_m2=joint_m2[0, :, 0] + joint_m2[k, :, k] - cross_m2 - cross_m2.T,
-                drift_m2ps2=drifts_m2ps2[np.ix_(pair, pair)],
+                covariance_m2=covariance_m2,
+                drifts=Drifts(
+                    gain=gain,
+                    left=_DRIFTS @ ends @ _DRIFTS.T - gain @ covariance_m2 @ gain.T,
+                ),
             )
         )
     return found

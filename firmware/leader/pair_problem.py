@@ -44,10 +44,23 @@ class PairProblem:
     white_m2: float
     shared_m2: float
     slope2: float
+    charges_m2: tuple[tuple[float, float], ...]  # of each layer; see Layer.charged
 
     def surface(self) -> ErrorSurface:
         """Return E at every lattice shift."""
         return error_surface(self.reference, self.query, self.minimum_cells, self.ridge_cells)
+
+    def surface_of(self, reference: GriddedSubmap, query: GriddedSubmap) -> ErrorSurface | None:
+        """Return E at every lattice shift of like grids, None when one of them is empty."""
+        layers = []
+        for layer, grid, charge in zip(
+            (self.reference, self.query), (reference, query), self.charges_m2, strict=True
+        ):
+            bare = prepare(grid, reconstructed=layer.reconstructed)
+            if bare is None:
+                return None
+            layers.append(bare.charged(*charge))
+        return error_surface(layers[0], layers[1], self.minimum_cells, self.ridge_cells)
 
     def error_at(self, shift_m: Array, *, absolute: bool) -> tuple[float, int, float]:
         """Return E at any shift, the overlap in cells and the depth offset."""
@@ -121,7 +134,8 @@ def pair_problem(
     fine_m2 = max(fine_relief_m2(s, settings.finest_wave_m) for s in spectra)
     slope2 = 0.5 * sum(mean_slope2(layer.grid) for layer in present)
     half_m2 = 0.5 * settings.cell_sigma_m**2 + settings.position_sigma_m**2 * slope2
-    layers = [layer.charged(fine_m2 if layer.reconstructed else 0.0, half_m2) for layer in present]
+    charges_m2 = tuple((fine_m2 if layer.reconstructed else 0.0, half_m2) for layer in present)
+    layers = [layer.charged(*charge) for layer, charge in zip(present, charges_m2, strict=True)]
     noise_m2 = sum(_per_cell(layer.noise_m2, layer) for layer in layers)
     rebuilt_m2 = sum(_per_cell(layer.map_m2, layer) for layer in layers if layer.reconstructed)
     shared_m2 = settings.correlated_share * rebuilt_m2
@@ -137,6 +151,7 @@ def pair_problem(
         white_m2=noise_m2 - shared_m2,
         shared_m2=shared_m2,
         slope2=slope2,
+        charges_m2=charges_m2,
     )
 
 

@@ -14,6 +14,7 @@ from firmware.leader.alignment import NoiseModel
 from firmware.leader.atlas import Sheet
 from firmware.leader.calibration import Calibration, Overlap
 from firmware.leader.displacement import Look
+from firmware.leader.drifts import AGE_S
 from firmware.leader.matches import MatchingSettings
 from firmware.leader.pair_problem import noise_model
 from firmware.leader.swath import Swath, levelled, swath_of
@@ -22,7 +23,6 @@ from firmware.submaps import GriddedSubmap
 
 _TILT_FLOOR = 5e-4  # attitude drifts by 0.03 degree
 _BEND_FLOOR_PER_M = 3e-6  # sound speed differs by 0.2 m/s across a survey
-_SPAN = np.sqrt(12.0)  # of a uniform distribution, in its standard deviations
 _OFFSET_FLOOR_M = 0.02  # heave and squat that do not average out
 
 
@@ -52,20 +52,16 @@ def side_of(sheet: Sheet, trajectory: Trajectory) -> Side:
     )
 
 
-def strain_m(origin: Side, target: Side, drift_m2ps2: Array) -> tuple[float, float]:
-    """Return how far cells of two sides may lie apart by drift that is not known, and its sigma.
+def strain_m(origin: Side, target: Side, drifts: Array) -> float:
+    """Return how far cells of two sides may lie apart by drift that is known to (4, 4) only.
 
-    drift_m2ps2 (4, 4) is the covariance of both drifts. Cells are older or younger than the middle
-    of their sub-map; where lines of opposite heading lie side by side the old ones meet the young.
-    The first is in m, a root mean square for each axis, the second in m/s.
+    Where lines of opposite heading lie side by side old cells meet young ones. It is a root mean
+    square, of each axis.
     """
-    age_s = [(s.sheet.track.time_s[-1] - s.sheet.track.time_s[0]) / _SPAN for s in (origin, target)]
     alike = float(origin.starboard @ target.starboard)
-    own = [np.trace(drift_m2ps2[k : k + 2, k : k + 2]) / 2.0 for k in (0, 2)]
-    between = np.trace(drift_m2ps2[:2, 2:]) / 2.0
-    apart_m2 = own[0] * age_s[0] ** 2 + own[1] * age_s[1] ** 2
-    apart_m2 -= 2.0 * alike * between * age_s[0] * age_s[1]
-    return float(np.sqrt(max(apart_m2, 0.0))), float(np.sqrt(max(own)))
+    own = np.trace(drifts) / 2.0
+    between = np.trace(drifts[:2, 2:]) / 2.0
+    return float(AGE_S * np.sqrt(max(own - 2.0 * alike * between, 0.0)))
 
 
 class Calibrations:
@@ -119,19 +115,11 @@ class Calibrations:
             covariance=calibration.covariance,
         )
 
-    def matching_of(
-        self, origin: Side, target: Side, shift_m: Array, drift_m2ps2: Array
-    ) -> MatchingSettings:
-        """Return the settings of a match with the sigmas that remain for this pair.
-
-        drift_m2ps2 (4, 4) is the covariance of the drifts of both, the origin's first.
-        """
+    def matching_of(self, origin: Side, target: Side, shift_m: Array) -> MatchingSettings:
+        """Return the settings of a match with the sigmas that remain for this pair."""
         tilt, bend = self._remaining(origin, target, shift_m)
-        apart_m, drift_mps = strain_m(origin, target, drift_m2ps2)
         return dataclasses.replace(
             self._matching,
-            strain_sigma_m=apart_m,
-            drift_sigma_mps=float(np.hypot(self._matching.drift_sigma_mps, drift_mps)),
             depth_offset_sigma_m=self._wander_m(origin, target),
             tilt_sigma=tilt,
             bend_sigma_per_m=bend,

@@ -2,8 +2,10 @@
 
 Depths that err by roll * y + smile * y^2 / W (see `swath`) betray beams that are turned by the roll
 and, by Snell's law, bent: a place seen at the across-track distance y, an altitude h below, really
-lies h * (roll + 2 * smile * y / W) farther to starboard. Lines of opposite heading seem too near
-each other by it, or too far, and every closure between them says the same.
+lies h * (roll + 2 * smile * y / W) farther to starboard: half of the second term is Snell's law at
+the sonar, half the scale of its ranges. Lines of opposite heading seem too near each other by it,
+or too far, and every closure between them says the same: what is not known of it yet is taken for
+noise of each, which is too good a view of many.
 """
 
 from dataclasses import dataclass
@@ -29,7 +31,7 @@ class Look:
 
     def displacement(self, lever_m: Array) -> Array:
         """Return how a place at the end of a lever (2,) is moved per unit of the errors, (2, 2)."""
-        across = float(self.starboard @ lever_m) / self.half_width_m
+        across = float(np.clip(self.starboard @ lever_m / self.half_width_m, -1.0, 1.0))
         return np.outer(self.starboard, [self.altitude_m, 2.0 * self.altitude_m * across])
 
 

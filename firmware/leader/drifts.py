@@ -21,9 +21,9 @@ from firmware.submaps import GriddedSubmap
 
 AGE_S = 40.0 / np.sqrt(12.0)  # of the cells of a sub-map, root mean square
 _REACH_SIGMAS = 2.5  # of the prior, beyond which the outermost drift has to do
-_APART_M = 3.0  # cells of two sub-maps, between one drift and the next: a cell off at the most
-UNRESOLVED_M = _APART_M / np.sqrt(12.0)
-_MOST = 7  # drifts along an axis; an odd number, so that the expected one is among them
+_APART_M = 3.0  # cells of two sub-maps, between one drift and the next
+_MOST_EACH_WAY = 3  # of drifts along an axis, beside the expected one
+_ROUNDED_M = 0.8  # between cells of two sub-maps, each to the nearest of two metres
 
 _FIELDS = ("residual_m2", "noise_m2", "overlap_cells", "depth_offset_m")
 _NO_OVERLAP = np.array([np.inf, 1.0, 0.0, 0.0])  # in the same order
@@ -44,32 +44,62 @@ class Drifts:
         """Return their covariance (4, 4) in (m/s)^2 where the offset is known to (2, 2)."""
         return np.asarray(self.left + self.gain @ offset_m2 @ self.gain.T)
 
+    def unresolved_m(self, offset_m2: Array) -> float:
+        """Return how far cells may still lie apart when every shift has the nearest drift."""
+        reaches_m = [self._reach_m(direction) for direction in _directions(offset_m2)]
+        steps = [max(_each_way(reach_m), 0.5) for reach_m in reaches_m]
+        spacings_m = [reach_m / step for reach_m, step in zip(reaches_m, steps, strict=True)]
+        coarse_m = max(spacings_m) / np.sqrt(12.0)
+        return float(coarse_m if max(steps) < 1.0 else np.hypot(coarse_m, _ROUNDED_M))
+
+    def steps_m(self, offset_m2: Array) -> list[Array]:
+        """Return vectors (S, 2) along both axes of an offset, each implying a drift of its own."""
+        steps = []
+        for direction in _directions(offset_m2):
+            each_way = _each_way(self._reach_m(direction))
+            parts = np.arange(-each_way, each_way + 1) / max(each_way, 1)
+            steps.append(np.outer(parts, direction))
+        return steps
+
+    def _reach_m(self, direction_m: Array) -> float:
+        """Return how far drift drives cells apart when an offset lies so far from the expected."""
+        drifts_mps = self.gain @ direction_m
+        return float(AGE_S * (np.hypot(*drifts_mps[:2]) + np.hypot(*drifts_mps[2:])))
+
 
 NO_DRIFT = Drifts(gain=np.zeros((4, 2)), left=np.zeros((4, 4)))
 
 
+def _directions(offset_m2: Array) -> Array:
+    """Return the vectors (2, 2) to the edge of what is likely, along the axes of a covariance."""
+    values, axes = np.linalg.eigh(offset_m2)
+    return np.asarray(_REACH_SIGMAS * np.sqrt(np.maximum(values, 0.0))[:, None] * axes.T)
+
+
+def _each_way(reach_m: float) -> int:
+    return min(int(np.ceil(reach_m / _APART_M - 0.5)), _MOST_EACH_WAY)
+
+
 def screened_by_drift(
     problem: PairProblem,
+    whole: ErrorSurface,
     grids: tuple[GriddedSubmap, GriddedSubmap],
     drifts: Drifts,
     prior: Prior,
-) -> ErrorSurface | None:
-    """Return E at every lattice shift, each with the drift taken out that the shift implies.
+) -> ErrorSurface:
+    """Return a surface with E at every lattice shift for the drift that the shift implies.
 
-    The grids of reference and query come without the drift that is expected. None where that
-    drift serves for all shifts that the prior leaves.
+    The grids of reference and query come without the drift that is expected; `whole` is their
+    surface, and it is returned where that drift serves for all shifts that the prior leaves.
     """
-    values, axes = np.linalg.eigh(prior.covariance_m2)
-    steps = [_steps(drifts.gain @ axes[:, k], float(np.sqrt(values[k]))) for k in (0, 1)]
-    if len(steps[0]) * len(steps[1]) == 1:
-        return None
-    whole = problem.surface()
-    shifts_m = np.stack(np.meshgrid(whole.north_m, whole.east_m, indexing="ij"), axis=-1)
-    along_m = (shifts_m - prior.mean_m) @ axes
-    nearest = [np.abs(along_m[..., k, None] - steps[k]).argmin(axis=-1) for k in (0, 1)]
+    steps_m = drifts.steps_m(prior.covariance_m2)
+    if all(len(steps) == 1 for steps in steps_m):
+        return whole
     fields = _fields(whole)
-    for i, j in itertools.product(range(len(steps[0])), range(len(steps[1]))):
-        change_mps = drifts.gain @ axes @ np.array([steps[0][i], steps[1][j]])
+    shifts_m = np.stack(np.meshgrid(whole.north_m, whole.east_m, indexing="ij"), axis=-1)
+    nearest = [_nearest(shifts_m - prior.mean_m, steps) for steps in steps_m]
+    for i, j in itertools.product(range(len(steps_m[0])), range(len(steps_m[1]))):
+        change_mps = drifts.gain @ (steps_m[0][i] + steps_m[1][j])
         wanted = (nearest[0] == i) & (nearest[1] == j)
         if np.any(change_mps) and wanted.any():
             part = problem.surface_of(
@@ -79,18 +109,19 @@ def screened_by_drift(
     return dataclasses.replace(whole, **dict(zip(_FIELDS, fields, strict=True)))
 
 
-def _steps(gain: Array, sigma_m: float) -> Array:
-    """Return shifts (S,) along an axis, about the expected one, at which drift is taken anew."""
-    apart_m = _REACH_SIGMAS * sigma_m * AGE_S * float(np.hypot(*gain[:2]) + np.hypot(*gain[2:]))
-    each_way = min(int(np.ceil(apart_m / _APART_M - 0.5)), _MOST // 2)
-    if each_way <= 0:
-        return np.zeros(1)
-    return np.asarray(_REACH_SIGMAS * sigma_m * np.arange(-each_way, each_way + 1) / each_way)
+def _nearest(away_m: Array, steps_m: Array) -> Array:
+    """Return which of the steps (S, 2) along one axis is nearest to each shift (K, L, 2)."""
+    longest_m = float(np.hypot(*steps_m[-1]))
+    if longest_m == 0.0:
+        return np.zeros(away_m.shape[:2], dtype=np.intp)
+    axis = steps_m[-1] / longest_m
+    return np.asarray(np.abs((away_m @ axis)[..., None] - steps_m @ axis).argmin(axis=-1))
 
 
 def _without(grid: GriddedSubmap, drift_mps: Array) -> GriddedSubmap:
+    """Return a grid warped anew, its cells not averaged: else every other drift would fit better."""
     middle_s = float(np.nanmedian(grid.time_s))
-    return remove_drift(grid, float(drift_mps[0]), float(drift_mps[1]), middle_s)
+    return remove_drift(grid, float(drift_mps[0]), float(drift_mps[1]), middle_s, nearest=True)
 
 
 def _fields(surface: ErrorSurface) -> Array:

@@ -21,6 +21,8 @@ def hint_of(
     problem: PairProblem, surface: ErrorSurface, relief: Relief, prior: Prior
 ) -> Hint | None:
     """Return the factor between prior and moments of the posterior, widened; None if it is weak."""
+    if not np.isfinite(surface.residual_m2).any():
+        return None
     settings, surface = problem.settings, problem.strained(surface)
     evidence = ambiguity.tempered_evidence(
         surface, _cautious(problem, surface, relief, prior), problem.correlated_cells

@@ -1,20 +1,23 @@
 """Which pairs of sub-maps are worth a match, and all that each of these matches needs."""
 
 import dataclasses
+from collections.abc import Set
 from dataclasses import dataclass
 
 import numpy as np
 
 from firmware.geometry import Array
-from firmware.leader.atlas import Atlas, Sheet, overlap_m2
+from firmware.leader.atlas import Atlas, Sheet, SheetId, overlap_m2
 from firmware.leader.closure_settings import ClosureSettings
 from firmware.leader.displacement import Look
-from firmware.leader.drifts import NO_DRIFT, UNRESOLVED_M, Drifts
+from firmware.leader.drifts import NO_DRIFT, Drifts
 from firmware.leader.estimate import Estimate
 from firmware.leader.matching import MatchingSettings, MatchOutcome, match
 from firmware.leader.offsets import Offset, correction_of, corrections, offsets_of
 from firmware.leader.pairing import Calibrations, Side, side_of, strain_m
 from firmware.submaps import GriddedSubmap
+
+_DOUBTED = 0.5  # of the strain that is expected: what ran away farther may have wandered instead
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,6 +35,7 @@ class MatchJob:
     settings: MatchingSettings
     looks: tuple[Look, Look]
     drifts: Drifts = NO_DRIFT
+    hinted: bool = True
 
     @property
     def prior_sigma_m(self) -> float:
@@ -49,6 +53,7 @@ class MatchJob:
             reference_reconstructed=self.origin.reconstructed,
             query_reconstructed=self.target.reconstructed,
             drifts=self.drifts,
+            hinted=self.hinted,
         )
 
 
@@ -77,7 +82,7 @@ def jobs_for(
     is taken out of all. Raises EstimationError if the sheet itself hangs on no node.
     """
     chosen = _worth_trying(_ranked(sheet, atlas, estimate, settings), settings)
-    return _jobs(sheet, chosen, estimate, calibrations, learn=True)
+    return _jobs(sheet, chosen, estimate, settings, calibrations)
 
 
 def jobs_again(
@@ -101,7 +106,14 @@ def jobs_again(
         values_m2 = np.linalg.eigvalsh(offset.covariance_m2)
         if 0.0 < values_m2[0] and values_m2[1] <= (settings.second_look_share * sigma_m) ** 2:
             shrunk.append(offset)
-    return _jobs(sheet, shrunk[: settings.pairs_per_submap], estimate, calibrations, learn=False)
+    return _jobs(
+        sheet,
+        shrunk[: settings.pairs_per_submap],
+        estimate,
+        settings,
+        calibrations,
+        have_hints={other for other, (_, hint) in last_look.items() if hint is not None},
+    )
 
 
 def _without_hint(offset: Offset, sheet: Sheet, hint: int, estimate: Estimate) -> Offset:
@@ -163,18 +175,22 @@ def _jobs(
     sheet: Sheet,
     chosen: list[Offset],
     estimate: Estimate,
+    settings: ClosureSettings,
     calibrations: Calibrations,
     *,
-    learn: bool,
+    have_hints: Set[SheetId] | None = None,
 ) -> list[MatchJob]:
-    """Return the matches of a sheet with those that it lies to as given."""
+    """Return the matches of a sheet with those that it lies to as given.
+
+    Pairs looked at for the second time come with have_hints: those of which no hint is asked.
+    """
     if not chosen:
         return []
     target = side_of(sheet, estimate.trajectory(sheet.id.chain))
     pairs = []
     for offset in chosen:
         origin = side_of(offset.origin, estimate.trajectory(offset.origin.id.chain))
-        if learn:
+        if have_hints is None:
             calibrations.learn(origin, target, offset.shift_m, offset.covariance_m2)
         pairs.append((origin, offset))
     grid = calibrations.level(target)
@@ -192,6 +208,8 @@ def _jobs(
                 calibrations.matching_of(origin, target, offset.shift_m), origin, target, offset
             ),
             drifts=offset.drifts,
+            hinted=offset.sigma_m >= settings.hint_prior_m
+            and origin.sheet.id not in (have_hints or ()),
             looks=(calibrations.look_of(origin), calibrations.look_of(target)),
         )
         for origin, offset in pairs
@@ -202,12 +220,14 @@ def _strained(
     settings: MatchingSettings, origin: Side, target: Side, offset: Offset
 ) -> MatchingSettings:
     """Return the settings of a pair with what is not known of its drifts."""
-    drifts = offset.drifts.covariance(offset.covariance_m2)
-    told_m2 = offset.drifts.gain @ offset.covariance_m2 @ offset.drifts.gain.T
-    unresolved_m = min(strain_m(origin, target, told_m2), UNRESOLVED_M)
+    known_m2, drifts = offset.covariance_m2, offset.drifts.covariance(offset.covariance_m2)
+    expected_m = strain_m(origin, target, drifts)
+    left_m = strain_m(origin, target, offset.drifts.left)
+    strained_m = min(float(np.hypot(left_m, offset.drifts.unresolved_m(known_m2))), expected_m)
+    strained_m = max(strained_m, _DOUBTED * expected_m)
     worst_mps = np.sqrt(max(np.trace(drifts[:2, :2]), np.trace(drifts[2:, 2:])) / 2.0)
     return dataclasses.replace(
         settings,
-        strain_sigma_m=float(np.hypot(strain_m(origin, target, offset.drifts.left), unresolved_m)),
+        strain_sigma_m=strained_m,
         drift_sigma_mps=float(np.hypot(settings.drift_sigma_mps, worst_mps)),
     )

@@ -45,6 +45,7 @@ def match(
     query_reconstructed: bool = False,
     times_s: tuple[float | None, float | None] = (None, None),
     drifts: Drifts = NO_DRIFT,
+    hinted: bool = True,
 ) -> MatchOutcome:
     """Return the shift between two overlapping sub-maps, or why it cannot be known.
 
@@ -52,7 +53,8 @@ def match(
     window that the prior implies, the best minima are refined below the cell, and the winner has
     to pass the threshold, carry evidence against unrelated seabed and leave little posterior mass
     elsewhere. times_s are the instants of reference and query to which the shift shall refer. A
-    pair that fails leaves a hint, for which every shift is judged with the drifts that it implies.
+    pair that fails leaves a hint, if one is asked for; then every shift is judged with the drifts
+    that it implies.
 
     Raises
     ------
@@ -77,11 +79,10 @@ def match(
     if relief is None:
         return _none(NoMatch.FEATURELESS)
     outcome = _search(problem, surface, relief, prior, times_s)
-    if outcome.match is not None:
+    if outcome.match is not None or not hinted:
         return outcome
-    by_drift = screened_by_drift(problem, (reference, query), drifts, prior)
-    if by_drift is not None:
-        surface = _window(by_drift, prior, problem) or surface
+    whole = screened_by_drift(problem, whole, (reference, query), drifts, prior)
+    surface = _window(whole, prior, problem) or surface
     return replace(outcome, hint=hint_of(problem, surface, relief, prior))
 
 

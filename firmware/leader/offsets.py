@@ -22,7 +22,7 @@ class Offset:
     """How a sheet lies to another one, the origin.
 
     shift_m (2,) is to be added to what dead reckoning says, each sheet's at its own time;
-    covariance_m2 (2, 2) is that of the offset. drifts belong to both, the origin's first.
+    covariance_m2 (2, 2) is that of the offset. drifts are those at the nodes of both.
     """
 
     origin: Sheet
@@ -30,8 +30,16 @@ class Offset:
     covariance_m2: Array
     drifts: Drifts
 
+    @property
+    def sigma_m(self) -> float:
+        """How well it is known in its worst direction."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance_m2)[-1]))
+
     def without(self, told_m: Array, told_m2: Array) -> "Offset":
-        """Return the offset with one of the Gaussian factors that it rests on taken out."""
+        """Return the offset with one of the Gaussian factors that it rests on taken out.
+
+        What the offset would tell of the drifts stays the same.
+        """
         told, known = np.linalg.inv(told_m2), np.linalg.inv(self.covariance_m2)
         left_m2 = np.linalg.inv(known - told)
         return replace(

@@ -51,7 +51,7 @@ class PairProblem:
         return error_surface(self.reference, self.query, self.minimum_cells, self.ridge_cells)
 
     def surface_of(self, reference: GriddedSubmap, query: GriddedSubmap) -> ErrorSurface | None:
-        """Return E at every lattice shift of like grids, None when one of them is empty."""
+        """Return E at every lattice shift of both grids warped, None when one is empty."""
         layers = []
         for layer, grid, charge in zip(
             (self.reference, self.query), (reference, query), self.charges_m2, strict=True
@@ -81,7 +81,7 @@ class PairProblem:
 
     def strained(self, surface: ErrorSurface) -> ErrorSurface:
         """Return a surface of which noise also explains what drift inside the sub-maps does."""
-        strained_m2 = self.settings.strain_sigma_m**2 * self.slope2
+        strained_m2 = 2.0 * self.settings.strain_sigma_m**2 * self.slope2  # north and east
         return dataclasses.replace(surface, noise_m2=surface.noise_m2 + strained_m2)
 
     def information(

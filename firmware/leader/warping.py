@@ -16,12 +16,15 @@ def remove_drift(
     drift_north_mps: float,
     drift_east_mps: float,
     reference_time_s: float,
+    *,
+    nearest: bool = False,
 ) -> GriddedSubmap:
     """Return the grid with a constant drift velocity of dead reckoning taken out.
 
     A cell measured at time t lies drift * (t - reference_time_s) too far along the drift; it is
     moved back by that, so that the whole grid agrees with dead reckoning at the reference time.
-    The grid keeps its cell size and grows by the largest displacement; values are bilinear.
+    The grid keeps its cell size and grows by the largest displacement; values are bilinear, or
+    those of the nearest cell: half a cell coarser, but as noisy as they were.
     """
     known = np.isfinite(grid.time_s) & np.isfinite(grid.depth_m)
     drift_mps = np.array([drift_north_mps, drift_east_mps])
@@ -40,6 +43,8 @@ def remove_drift(
         time_s = _planar_time(grid, known, row + step[0], col + step[1])
     step = drift_mps[:, None, None] * (time_s - reference_time_s) / grid.cell_m
     source_row, source_col = row + step[0], col + step[1]
+    if nearest:
+        source_row, source_col = np.round(source_row), np.round(source_col)
     return dataclasses.replace(
         grid,
         north0_m=grid.north0_m + low[0] * grid.cell_m,

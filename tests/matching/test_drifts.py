@@ -3,13 +3,15 @@
 import dataclasses
 
 import numpy as np
+import pytest
 
 from firmware.geometry import Array
 from firmware.leader.ambiguity import Prior
 from firmware.leader.drifts import NO_DRIFT, Drifts, screened_by_drift
-from firmware.leader.matching import MatchingSettings
+from firmware.leader.matching import MatchingSettings, match
 from firmware.leader.pair_problem import pair_problem
 from firmware.leader.screening import ErrorSurface
+from firmware.leader.warping import remove_drift
 from firmware.submaps import GriddedSubmap
 from tests.matching.scenes import Scene
 
@@ -47,9 +49,8 @@ def test_true_shift_fits_once_the_drift_that_it_implies_is_taken_out() -> None:
         reference, query, settings, reference_reconstructed=False, query_reconstructed=False
     )
     assert problem is not None
-    by_drift = screened_by_drift(problem, (reference, query), LINEAR, PRIOR)
-    assert by_drift is not None
     plain = problem.surface()
+    by_drift = screened_by_drift(problem, plain, (reference, query), LINEAR, PRIOR)
     assert by_drift.residual_m2.shape == plain.residual_m2.shape
     assert _misfit(plain, TRUE_M) > 3.0 * _misfit(by_drift, TRUE_M)
     assert _misfit(by_drift, np.zeros(2)) == _misfit(plain, np.zeros(2))
@@ -62,6 +63,59 @@ def test_known_drift_needs_no_second_look() -> None:
         *grids, MatchingSettings(), reference_reconstructed=False, query_reconstructed=False
     )
     assert problem is not None
-    assert screened_by_drift(problem, grids, NO_DRIFT, PRIOR) is None
-    near = Prior(np.zeros(2), np.eye(2))
-    assert screened_by_drift(problem, grids, LINEAR, near) is None
+    plain, near = problem.surface(), Prior(np.zeros(2), np.eye(2))
+    assert screened_by_drift(problem, plain, grids, NO_DRIFT, PRIOR) is plain
+    assert screened_by_drift(problem, plain, grids, LINEAR, near) is plain
+
+
+def test_drift_that_is_not_there_draws_no_hint_away() -> None:
+    settings = MatchingSettings(position_sigma_m=0.1, walk_m2_per_s=0.0, drift_sigma_mps=0.0)
+    hints = []
+    for seed in range(12):
+        scene = Scene(seed, rms_m=0.05)
+        first, second = (
+            remove_drift(scene.submap(140, 150, (41, 60)), 0.02, 0.03, 20.0) for _ in range(2)
+        )
+        found = match(first, second, np.zeros(2), PRIOR.covariance_m2, settings, drifts=LINEAR)
+        if found.hint is not None:
+            hints.append(float(np.hypot(*found.hint.shift_m)))
+    assert len(hints) >= 2
+    assert max(hints) < 5.0
+
+
+def test_drifts_of_both_sides_are_told_apart() -> None:
+    gain = np.array([[0.0, 0.0], [0.0, 0.0], [-0.004, 0.001], [0.0, -0.006]])
+    drifts = Drifts(gain=gain, left=1e-6 * np.eye(4))
+    offset_m2 = np.diag([400.0, 900.0])
+    assert drifts.covariance(offset_m2)[2:, 2:] == pytest.approx(
+        gain[2:] @ offset_m2 @ gain[2:].T + 1e-6 * np.eye(2)
+    )
+    assert drifts.covariance(offset_m2)[:2, :2] == pytest.approx(1e-6 * np.eye(2))
+    assert 0.7 < drifts.unresolved_m(offset_m2) < 1.8
+    assert drifts.unresolved_m(100.0 * offset_m2) > 4.0  # more drifts than are tried
+
+
+def test_query_is_warped_by_its_own_drift() -> None:
+    scene = Scene(3)
+    still = scene.submap(140, 150, (41, 60))
+    query = _strained(scene, southward=True)
+    query = dataclasses.replace(
+        query, north0_m=query.north0_m - TRUE_M[0], east0_m=query.east0_m - TRUE_M[1]
+    )
+    problem = pair_problem(
+        still, query, MatchingSettings(), reference_reconstructed=False, query_reconstructed=False
+    )
+    assert problem is not None
+    plain, own, other = problem.surface(), -np.eye(2) / APART_S, np.zeros((2, 2))
+    right, wrong = (
+        screened_by_drift(
+            problem,
+            plain,
+            (still, query),
+            Drifts(gain=np.vstack(parts), left=np.zeros((4, 4))),
+            PRIOR,
+        )
+        for parts in ((other, own), (own, other))
+    )
+    assert 1.5 * _misfit(right, TRUE_M) < _misfit(plain, TRUE_M)
+    assert 1.2 * _misfit(right, TRUE_M) < _misfit(wrong, TRUE_M)

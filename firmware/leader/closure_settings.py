@@ -10,7 +10,7 @@ class ClosureSettings(Settings):
     """How many pairs are tried, and what a closure must withstand."""
 
     pairs_per_submap: int = setting(
-        12, "pairs", "bounds the work of one sub-map to a tenth of a second", minimum=1
+        12, "pairs", "a tenth of a second of work; some seconds while drift is unknown", minimum=1
     )
     known_pairs_per_submap: int = setting(
         3, "pairs", "of those whose offset is known already; more would say it again", minimum=1

@@ -70,16 +70,6 @@ class Drifts:
 NO_DRIFT = Drifts(gain=np.zeros((4, 2)), left=np.zeros((4, 4)))
 
 
-def _directions(offset_m2: Array) -> Array:
-    """Return the vectors (2, 2) to the edge of what is likely, along the axes of a covariance."""
-    values, axes = np.linalg.eigh(offset_m2)
-    return np.asarray(_REACH_SIGMAS * np.sqrt(np.maximum(values, 0.0))[:, None] * axes.T)
-
-
-def _each_way(reach_m: float) -> int:
-    return min(int(np.ceil(reach_m / _APART_M - 0.5)), _MOST_EACH_WAY)
-
-
 def screened_by_drift(
     problem: PairProblem,
     whole: ErrorSurface,
@@ -109,6 +99,16 @@ def screened_by_drift(
     return dataclasses.replace(whole, **dict(zip(_FIELDS, fields, strict=True)))
 
 
+def _directions(offset_m2: Array) -> Array:
+    """Return the vectors (2, 2) to the edge of what is likely, along the axes of a covariance."""
+    values, axes = np.linalg.eigh(offset_m2)
+    return np.asarray(_REACH_SIGMAS * np.sqrt(np.maximum(values, 0.0))[:, None] * axes.T)
+
+
+def _each_way(reach_m: float) -> int:
+    return min(int(np.ceil(reach_m / _APART_M - 0.5)), _MOST_EACH_WAY)
+
+
 def _nearest(away_m: Array, steps_m: Array) -> Array:
     """Return which of the steps (S, 2) along one axis is nearest to each shift (K, L, 2)."""
     longest_m = float(np.hypot(*steps_m[-1]))
@@ -119,7 +119,7 @@ def _nearest(away_m: Array, steps_m: Array) -> Array:
 
 
 def _without(grid: GriddedSubmap, drift_mps: Array) -> GriddedSubmap:
-    """Return a grid warped anew, its cells not averaged: else every other drift would fit better."""
+    """Return a grid warped anew. Its cells are not averaged: else any other drift fitted better."""
     middle_s = float(np.nanmedian(grid.time_s))
     return remove_drift(grid, float(drift_mps[0]), float(drift_mps[1]), middle_s, nearest=True)
 

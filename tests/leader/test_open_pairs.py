@@ -8,12 +8,13 @@ import pytest
 
 from firmware.leader.atlas import Atlas, Sheet, SheetId, sheet_of
 from firmware.leader.closure_settings import ClosureSettings
-from firmware.leader.closures import enter_hint
+from firmware.leader.closures import closure_of, enter_hint
 from firmware.leader.displacement import Look
 from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.judgement import Judgement, JudgementSettings
 from firmware.leader.match_jobs import MatchJob, jobs_again
-from firmware.leader.matching import Hint, MatchingSettings, MatchOutcome, NoMatch
+from firmware.leader.matching import Hint, Match, MatchingSettings, MatchOutcome, NoMatch
+from firmware.leader.offsets import offsets_of
 from firmware.leader.open_pairs import OpenPairs
 from firmware.leader.pairing import Calibrations
 from firmware.leader.pose_graph import PoseGraph
@@ -168,6 +169,46 @@ def test_what_the_pair_itself_has_told_does_not_make_it_better_known(graph: Pose
     )
     assert after.prior_shift_m == pytest.approx(before.prior_shift_m, abs=1e-2)
     assert _looks(graph, before.prior_sigma_m, hint) == []
+
+
+def test_offset_tells_drift_as_the_time_between_the_sheets_says(graph: PoseGraph) -> None:
+    origin, target = _two_sheets()
+    (offset,) = offsets_of(target, [origin], graph)
+    apart_s, known_m2 = target.time_s - origin.time_s, offset.covariance_m2
+    assert offset.drifts.gain == pytest.approx(np.tile(-np.eye(2) / apart_s, (2, 1)), rel=0.1)
+    drifts = offset.drifts.covariance(known_m2)
+    assert np.diag(drifts) == pytest.approx(np.full(4, 0.2**2), rel=0.1)
+    assert np.trace(offset.drifts.left) < 0.1 * np.trace(drifts)
+
+
+def test_closure_is_told_where_the_sonar_really_looked(graph: PoseGraph) -> None:
+    (job,) = _looks(graph, 1e6)
+    grid = job.origin.grid
+    found = Match(
+        shift_m=np.zeros(2),
+        covariance_m2=np.eye(2),
+        residual=0.01,
+        overlap_cells=100,
+        depth_offset_m=0.0,
+        axis_deg=None,
+        false_mass=0.0,
+        log_evidence=9.0,
+        misfit=1.0,
+        variance_m2=0.01,
+        centre_m=np.array([grid.north0_m, grid.east0_m]),
+        reference_time_s=job.origin.time_s,
+        query_time_s=job.target.time_s,
+    )
+    rolled = dataclasses.replace(LOOK, errors=np.array([0.01, 0.0]))
+    outcome = MatchOutcome(match=found, reason=None)
+    closures = [
+        closure_of(dataclasses.replace(job, looks=looks), outcome, graph, 200.0)
+        for looks in ((LOOK, LOOK), (rolled, LOOK))
+    ]
+    assert closures[0] is not None
+    assert closures[1] is not None
+    aside_m = closures[1].offset_m - closures[0].offset_m
+    assert aside_m == pytest.approx([0.0, 0.01 * LOOK.altitude_m])
 
 
 def test_no_sheet_has_two_turns_beside_a_new_one(atlas: Atlas, graph: PoseGraph) -> None:

@@ -17,8 +17,6 @@ from firmware.leader.offsets import Offset, correction_of, corrections, offsets_
 from firmware.leader.pairing import Calibrations, Side, side_of, strain_m
 from firmware.submaps import GriddedSubmap
 
-_DOUBTED = 0.5  # of the strain that is expected: what ran away farther may have wandered instead
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatchJob:
@@ -224,7 +222,6 @@ def _strained(
     expected_m = strain_m(origin, target, drifts)
     left_m = strain_m(origin, target, offset.drifts.left)
     strained_m = min(float(np.hypot(left_m, offset.drifts.unresolved_m(known_m2))), expected_m)
-    strained_m = max(strained_m, _DOUBTED * expected_m)
     worst_mps = np.sqrt(max(np.trace(drifts[:2, :2]), np.trace(drifts[2:, 2:])) / 2.0)
     return dataclasses.replace(
         settings,

@@ -72,21 +72,21 @@ NO_DRIFT = Drifts(gain=np.zeros((4, 2)), left=np.zeros((4, 4)))
 
 def screened_by_drift(
     problem: PairProblem,
-    whole: ErrorSurface,
+    surface: ErrorSurface,
     grids: tuple[GriddedSubmap, GriddedSubmap],
     drifts: Drifts,
     prior: Prior,
 ) -> ErrorSurface:
     """Return a surface with E at every lattice shift for the drift that the shift implies.
 
-    The grids of reference and query come without the drift that is expected; `whole` is their
-    surface, and it is returned where that drift serves for all shifts that the prior leaves.
+    The grids of reference and query come without the drift that is expected; `surface` is theirs,
+    or a window of it, and is returned where that drift serves for all shifts that the prior leaves.
     """
     steps_m = drifts.steps_m(prior.covariance_m2)
     if all(len(steps) == 1 for steps in steps_m):
-        return whole
-    fields = _fields(whole)
-    shifts_m = np.stack(np.meshgrid(whole.north_m, whole.east_m, indexing="ij"), axis=-1)
+        return surface
+    fields = _fields(surface)
+    shifts_m = np.stack(np.meshgrid(surface.north_m, surface.east_m, indexing="ij"), axis=-1)
     nearest = [_nearest(shifts_m - prior.mean_m, steps) for steps in steps_m]
     for i, j in itertools.product(range(len(steps_m[0])), range(len(steps_m[1]))):
         change_mps = drifts.gain @ (steps_m[0][i] + steps_m[1][j])
@@ -95,8 +95,8 @@ def screened_by_drift(
             part = problem.surface_of(
                 _without(grids[0], change_mps[:2]), _without(grids[1], change_mps[2:])
             )
-            _fill(fields, whole, part, wanted)
-    return dataclasses.replace(whole, **dict(zip(_FIELDS, fields, strict=True)))
+            _fill(fields, surface, part, wanted)
+    return dataclasses.replace(surface, **dict(zip(_FIELDS, fields, strict=True)))
 
 
 def _directions(offset_m2: Array) -> Array:
@@ -130,16 +130,16 @@ def _fields(surface: ErrorSurface) -> Array:
 
 
 def _fill(
-    fields: Array, whole: ErrorSurface, part: ErrorSurface | None, wanted: NDArray[np.bool_]
+    fields: Array, surface: ErrorSurface, part: ErrorSurface | None, wanted: NDArray[np.bool_]
 ) -> None:
-    """Write a surface into fields (4, K, L) on the lattice of the whole, where it is wanted."""
+    """Write a surface into fields (4, K, L) on the lattice of another, where it is wanted."""
     fields[:, wanted] = _NO_OVERLAP[:, None]
     if part is None:
         return
     row, column = np.nonzero(wanted)
-    cell_m = float(whole.north_m[1] - whole.north_m[0])
-    part_row = row + round((whole.north_m[0] - part.north_m[0]) / cell_m)
-    part_column = column + round((whole.east_m[0] - part.east_m[0]) / cell_m)
+    cell_m = float(surface.north_m[1] - surface.north_m[0])
+    part_row = row + round((surface.north_m[0] - part.north_m[0]) / cell_m)
+    part_column = column + round((surface.east_m[0] - part.east_m[0]) / cell_m)
     inside = (part_row >= 0) & (part_row < part.north_m.size)
     inside &= (part_column >= 0) & (part_column < part.east_m.size)
     values = _fields(part)[:, part_row[inside], part_column[inside]]

@@ -157,10 +157,8 @@ class Estimate:
 
         Raises EstimationError if the information matrix is singular.
         """
-        keys = list(dict.fromkeys(anchor.key for anchor in anchors))
-        row = {key: 2 * k for k, key in enumerate(keys)}
-        rows = [row[anchor.key] + axis for anchor in anchors for axis in (0, 1)]
-        return np.asarray(self._joint_covariance(keys)[np.ix_(rows, rows)])
+        positions_m2 = self.state_covariance(anchors)[:, _POSITION, :, _POSITION]
+        return np.asarray(positions_m2.reshape(2 * len(anchors), 2 * len(anchors)))
 
     def state_covariance(self, anchors: list[Anchor]) -> Array:
         """Return the joint covariance (A, 4, A, 4) of positions in m and drifts in m/s of anchors.

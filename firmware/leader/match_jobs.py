@@ -153,9 +153,8 @@ def _worth_trying(ranked: list[Offset], settings: ClosureSettings) -> list[Offse
     """Return the first of the ranked pairs, but few whose offset is known before the match."""
     chosen, known = [], 0
     for offset in ranked:
-        largest_m2 = np.linalg.eigvalsh(offset.covariance_m2)[-1]
-        is_known = largest_m2 <= settings.known_sigma_m**2
-        known += bool(is_known)
+        is_known = offset.sigma_m <= settings.known_sigma_m
+        known += is_known
         if not is_known or known <= settings.known_pairs_per_submap:
             chosen.append(offset)
     return chosen[: settings.pairs_per_submap]
@@ -218,11 +217,12 @@ def _strained(
     settings: MatchingSettings, origin: Side, target: Side, offset: Offset
 ) -> MatchingSettings:
     """Return the settings of a pair with what is not known of its drifts."""
-    known_m2, drifts = offset.covariance_m2, offset.drifts.covariance(offset.covariance_m2)
-    expected_m = strain_m(origin, target, drifts)
+    known_m2 = offset.covariance_m2
+    drift_m2ps2 = offset.drifts.covariance(known_m2)
+    expected_m = strain_m(origin, target, drift_m2ps2)
     left_m = strain_m(origin, target, offset.drifts.left)
     strained_m = min(float(np.hypot(left_m, offset.drifts.unresolved_m(known_m2))), expected_m)
-    worst_mps = np.sqrt(max(np.trace(drifts[:2, :2]), np.trace(drifts[2:, 2:])) / 2.0)
+    worst_mps = np.sqrt(max(np.trace(drift_m2ps2[:2, :2]), np.trace(drift_m2ps2[2:, 2:])) / 2.0)
     return dataclasses.replace(
         settings,
         strain_sigma_m=strained_m,

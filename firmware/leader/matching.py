@@ -81,8 +81,7 @@ def match(
     outcome = _search(problem, surface, relief, prior, times_s)
     if outcome.match is not None or not hinted:
         return outcome
-    whole = screened_by_drift(problem, whole, (reference, query), drifts, prior)
-    surface = _window(whole, prior, problem) or surface
+    surface = screened_by_drift(problem, surface, (reference, query), drifts, prior)
     return replace(outcome, hint=hint_of(problem, surface, relief, prior))
 
 

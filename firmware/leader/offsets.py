@@ -33,7 +33,7 @@ class Offset:
     @property
     def sigma_m(self) -> float:
         """How well it is known in its worst direction."""
-        return float(np.sqrt(np.linalg.eigvalsh(self.covariance_m2)[-1]))
+        return float(np.sqrt(max(np.linalg.eigvalsh(self.covariance_m2)[-1], 0.0)))
 
     def without(self, told_m: Array, told_m2: Array) -> "Offset":
         """Return the offset with one of the Gaussian factors that it rests on taken out.

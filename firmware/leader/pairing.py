@@ -52,15 +52,15 @@ def side_of(sheet: Sheet, trajectory: Trajectory) -> Side:
     )
 
 
-def strain_m(origin: Side, target: Side, drifts: Array) -> float:
+def strain_m(origin: Side, target: Side, drift_m2ps2: Array) -> float:
     """Return how far cells of two sides may lie apart by drift that is known to (4, 4) only.
 
     Where lines of opposite heading lie side by side old cells meet young ones. It is a root mean
     square, of each axis.
     """
     alike = float(origin.starboard @ target.starboard)
-    own = np.trace(drifts) / 2.0
-    between = np.trace(drifts[:2, 2:]) / 2.0
+    own = np.trace(drift_m2ps2) / 2.0
+    between = np.trace(drift_m2ps2[:2, 2:]) / 2.0
     return float(AGE_S * np.sqrt(max(own - 2.0 * alike * between, 0.0)))
 
 

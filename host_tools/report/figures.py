@@ -91,7 +91,8 @@ def errors_over_time(result: MissionResult) -> Figure:
         title = vehicle.name.replace("_", " ")
         axes.set(title=title, xlabel="time (min)", ylabel="error (m)", yscale="log")
         axes.grid(alpha=0.25, which="both")
-    panels[0].legend(loc="upper left", fontsize=8)
+    lines, labels = panels[0].get_legend_handles_labels()
+    figure.legend(lines, labels, loc="outside lower center", ncols=len(lines), fontsize=8)
     return figure
 
 

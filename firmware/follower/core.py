@@ -167,6 +167,7 @@ class FollowerCore:
             "bad_beams": self._builder.bad_beams,
             "bad_pings": self._builder.bad_pings,
             "answers_used": self._correction.accepted,
+            "answers_without_news": self._correction.empty,
             "answers_gated": self._correction.gated,
             "answers_stale": self._correction.stale,
             "answers_restarted_us": self._correction.restarted,

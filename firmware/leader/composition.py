@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from firmware.geometry import Array
 from firmware.leader.chains import Chain
 from firmware.leader.ledger import (
-    QUARTER_TURN,
     AbsoluteRecord,
     Anchor,
     ClosureRecord,
@@ -26,6 +25,7 @@ from firmware.leader.ledger import (
     RangeRecord,
     Record,
     SharedDriftRecord,
+    as_reckoned,
 )
 from protocol.settings import Settings, setting
 
@@ -114,7 +114,7 @@ class Composition:
 
     owners maps each dropped node to the one it is added to, apart_m2 to the covariance (2, 2) of
     the way between the two; old holds the keys of the nodes before the window of detail; estimate
-    has the position (2,) of every node, dropped ones among them, and each vehicle's parameters and
+    has the state (4,) of every node, dropped ones among them, and each vehicle's parameters and
     clock (2,).
     """
 
@@ -163,16 +163,15 @@ class Composition:
             _keep(closure_group, self._one_closure, kept, new)
         return Coarse(kept=dict(sorted(kept.items())), new=new)
 
-    def _anchored(self, anchor: Anchor, *, as_reckoned: bool = False) -> Anchor:
-        """Return an anchor at a node that stays; the way there estimated, or as it was reckoned."""
+    def _anchored(self, anchor: Anchor) -> Anchor:
+        """Return an anchor at a node that stays, with the way there as it was reckoned."""
         owner = self._owners.get(anchor.key)
         if owner is None:
             return anchor
-        shift_m = self._estimate[anchor.key] - self._estimate[owner]
-        if as_reckoned:
-            heading_rad, scale = self._estimate[anchor.parameters]
-            shift_m = shift_m + heading_rad * QUARTER_TURN @ shift_m + scale * shift_m
-        return replace(anchor, key=owner, offset_m=anchor.offset_m + shift_m)
+        here, there = self._estimate[anchor.key], self._estimate[owner]
+        moved_m = here[:2] - anchor.lag_s * here[2:] - there[:2]
+        reckoned_m = as_reckoned(moved_m, self._estimate[anchor.parameters])
+        return replace(anchor, key=owner, offset_m=anchor.offset_m + reckoned_m, lag_s=0.0)
 
     def _moved(self, record: Link) -> Link:
         """Return a record between nodes that stay, as uncertain as the ways to them make it.
@@ -184,30 +183,16 @@ class Composition:
         if not apart_m2:
             return record
         spread_m2 = self._settings.closures_per_piece * np.sum(apart_m2, axis=0)
-        as_reckoned = isinstance(record, ClosureRecord)
-        origin, target = (self._anchored(end, as_reckoned=as_reckoned) for end in ends)
+        origin, target = (self._anchored(end) for end in ends)
         moved = replace(record, origin=origin, target=target)
         if isinstance(moved, ClosureRecord):
             return replace(moved, covariance_m2=moved.covariance_m2 + spread_m2)
-        _, direction = self._range_innovation_m(moved)
+        _, direction = moved.innovation_m(self._estimate.__getitem__)
         variance_m2 = moved.sigma_m**2 + float(direction @ spread_m2 @ direction)
         return replace(moved, sigma_m=float(np.sqrt(variance_m2)))
 
     def _is_old(self, record: ClosureRecord | RangeRecord) -> bool:
         return record.origin.key in self._old and record.target.key in self._old
-
-    def _ends_m(self, record: ClosureRecord | RangeRecord) -> tuple[Array, Array]:
-        return self._estimate[record.origin.key], self._estimate[record.target.key]
-
-    def _range_innovation_m(self, record: RangeRecord) -> tuple[float, Array]:
-        clock = None if record.clock is None else self._estimate[record.clock]
-        return record.innovation_m(*self._ends_m(record), clock)
-
-    def _innovation_m(self, record: ClosureRecord) -> Array:
-        ends = record.origin, record.target
-        return record.innovation_m(
-            *self._ends_m(record), tuple(self._estimate[end.parameters] for end in ends)
-        )
 
     def _thinned(
         self, closures: Mapping[tuple[int, int], Group[ClosureRecord]]
@@ -232,7 +217,7 @@ class Composition:
         ]
 
     def _is_true(self, record: ClosureRecord) -> bool:
-        innovation_m = self._innovation_m(record)
+        innovation_m = record.innovation_m(self._estimate.__getitem__)
         chi_square = innovation_m @ np.linalg.solve(record.covariance_m2, innovation_m)
         return bool(chi_square <= self._settings.reject_chi_square)
 
@@ -240,7 +225,7 @@ class Composition:
         """Return their weighted mean, as uncertain as one of them: neighbours err alike."""
         weights = [np.linalg.inv(record.covariance_m2) for record in records]
         covariance_m2 = np.linalg.inv(np.sum(weights, axis=0))
-        innovations_m = [self._innovation_m(record) for record in records]
+        innovations_m = [record.innovation_m(self._estimate.__getitem__) for record in records]
         mean_m = covariance_m2 @ np.sum(
             [w @ i for w, i in zip(weights, innovations_m, strict=True)], axis=0
         )
@@ -253,8 +238,8 @@ class Composition:
     def _one_range(self, records: list[RangeRecord]) -> RangeRecord:
         """Return the one in the middle with the mean of all innovations."""
         middle = records[len(records) // 2]
-        innovations_m = [self._range_innovation_m(record)[0] for record in records]
-        own_m = self._range_innovation_m(middle)[0]
+        innovations_m = [r.innovation_m(self._estimate.__getitem__)[0] for r in records]
+        own_m = innovations_m[len(records) // 2]
         sigma_m = float(np.sqrt(np.sum([r.sigma_m**2 for r in records])) / len(records))
         return replace(
             middle,

@@ -11,7 +11,14 @@ import numpy as np
 from firmware.geometry import Array
 from firmware.leader.chains import Chain
 from firmware.leader.graph_settings import GraphSettings
-from firmware.leader.ledger import Anchor, ClosureRecord, Entry, clock_row
+from firmware.leader.ledger import (
+    Anchor,
+    ClosureRecord,
+    Entry,
+    as_reckoned,
+    clock_row,
+    position_of,
+)
 from firmware.leader.solver import Solver
 from firmware.leader.trajectory import Trajectory
 from firmware.leader.wander import DriftChange, Wandering, changes_of
@@ -81,13 +88,12 @@ class Estimate:
                 f"vehicle {vehicle} has no node near {time_s:.1f} s; the nearest is at "
                 f"{chain.times_s[nearest]:.1f} s"
             )
-        bias_mps = self._state(key)[2:]
-        moved_m = track.position_at(time_s) - chain.reckoned_m[nearest]
         return Anchor(
             key=key,
             parameters=chain.parameters,
-            offset_m=moved_m - bias_mps * lag_s,
+            offset_m=track.position_at(time_s) - chain.reckoned_m[nearest],
             time_s=time_s,
+            lag_s=lag_s,
         )
 
     def trajectory(self, vehicle: int) -> Trajectory:
@@ -117,15 +123,11 @@ class Estimate:
 
     def position(self, anchor: Anchor) -> Array:
         """Return the estimated position (2,) of an anchor."""
-        return self._state(anchor.key)[:2] + anchor.offset_m
+        return position_of(anchor, self._state)
 
     def offset(self, origin: Anchor, target: Anchor) -> Array:
         """Return what a closure between two anchors would measure by this estimate, (2,)."""
-        places_m = [
-            self.position(end) - end.turning @ self._state(end.parameters)
-            for end in (origin, target)
-        ]
-        return np.asarray(places_m[1] - places_m[0])
+        return self.position(target) - self.position(origin)
 
     def closure(self, number: int) -> ClosureRecord:
         """Return a closure or hint of the ledger.
@@ -139,11 +141,7 @@ class Estimate:
 
     def innovation(self, number: int) -> Array:
         """Return estimated minus measured offset (2,) of a closure, in metres."""
-        record = self.closure(number)
-        ends = (record.origin, record.target)
-        origin_m, target_m = (self._state(end.key)[:2] for end in ends)
-        parameters = [self._state(end.parameters) for end in ends]
-        return record.innovation_m(origin_m, target_m, (parameters[0], parameters[1]))
+        return self.closure(number).innovation_m(self._state)
 
     def chi_square(self, number: int) -> float:
         """Return the squared innovation of a closure in units of its covariance."""
@@ -157,8 +155,18 @@ class Estimate:
 
         Raises EstimationError if the information matrix is singular.
         """
-        positions_m2 = self.state_covariance(anchors)[:, _POSITION, :, _POSITION]
-        return np.asarray(positions_m2.reshape(2 * len(anchors), 2 * len(anchors)))
+        nodes = list(dict.fromkeys(anchor.key for anchor in anchors))
+        parameters = list(dict.fromkeys(anchor.parameters for anchor in anchors))
+        self.update()
+        joint = self._solver.covariance([*nodes, *parameters])
+        rows = np.zeros((len(anchors), 2, len(joint)))
+        for row, anchor in zip(rows, anchors, strict=True):
+            node = 4 * nodes.index(anchor.key)
+            row[:, node : node + 4] = anchor.by_state
+            calibration = 4 * len(nodes) + 2 * parameters.index(anchor.parameters)
+            row[:, calibration : calibration + 2] = -anchor.turning
+        by_all = rows.reshape(-1, len(joint))
+        return np.asarray(by_all @ joint @ by_all.T)
 
     def state_covariance(self, anchors: list[Anchor]) -> Array:
         """Return the joint covariance (A, 4, A, 4) of positions in m and drifts in m/s of anchors.
@@ -259,7 +267,8 @@ class Estimate:
     def _anchor_in_shape(self, vehicle: int, key: int, time_s: float, track: Track) -> Anchor:
         here_m = self.trajectory(vehicle).correct(time_s, track.position_at(time_s))
         moved_m, parameters = here_m - self._state(key)[:2], self._chains[vehicle].parameters
-        return Anchor(key=key, parameters=parameters, offset_m=moved_m, time_s=time_s)
+        offset_m = as_reckoned(moved_m, self._state(parameters))
+        return Anchor(key=key, parameters=parameters, offset_m=offset_m, time_s=time_s)
 
     def _forget_solution(self) -> None:
         self._trajectories.clear()

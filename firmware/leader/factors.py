@@ -9,6 +9,7 @@ from firmware.geometry import Array
 from firmware.leader.ledger import (
     QUARTER_TURN,
     AbsoluteRecord,
+    Anchor,
     ClosureRecord,
     OdometryRecord,
     PriorRecord,
@@ -18,8 +19,7 @@ from firmware.leader.ledger import (
     SharedWalkRecord,
 )
 
-_POSITION = np.eye(2, 4)  # takes a node's state to its position
-_BIAS = np.eye(2, 4, 2)  # and this to its bias
+_BIAS = np.eye(2, 4, 2)  # takes a node's state to its bias
 _Jacobians = list[Array] | None
 
 
@@ -111,54 +111,49 @@ def _custom(
 
 def _closure(record: ClosureRecord, noise: gtsam.noiseModel.Base) -> gtsam.NonlinearFactor:
     """Return a factor of two nodes and of the parameters of one vehicle, or of two."""
-    origin, target = record.origin, record.target
-    turning = {origin.parameters: np.zeros((2, 2)), target.parameters: np.zeros((2, 2))}
-    turning[origin.parameters] += origin.turning
-    turning[target.parameters] -= target.turning
-    keys = [origin.key, target.key, *turning]
+    ways = _way(record.origin, record.target)
 
     def error(_this: object, values: gtsam.Values, jacobians: _Jacobians) -> Array:
         if jacobians is not None:
-            jacobians[0], jacobians[1] = -_POSITION, _POSITION
-            for k, turned in enumerate(turning.values(), start=2):
-                jacobians[k] = turned
-        return record.innovation_m(
-            values.atVector(origin.key)[:2],
-            values.atVector(target.key)[:2],
-            (values.atVector(origin.parameters), values.atVector(target.parameters)),
-        )
+            for k, way in enumerate(ways.values()):
+                jacobians[k] = way
+        return record.innovation_m(values.atVector)
 
-    return _custom(noise, keys, error)
+    return _custom(noise, list(ways), error)
 
 
 def _range(record: RangeRecord, noise: gtsam.noiseModel.Base) -> gtsam.NonlinearFactor:
-    keys = [record.origin.key, record.target.key]
-    if record.clock is not None:
-        keys.append(record.clock)
+    """Return a factor of what a closure is of, and of a clock where one is estimated."""
+    ways = _way(record.origin, record.target)
+    clocks = [] if record.clock is None else [record.clock]
 
     def error(_this: object, values: gtsam.Values, jacobians: _Jacobians) -> Array:
-        miss_m, direction = record.innovation_m(
-            values.atVector(keys[0])[:2],
-            values.atVector(keys[1])[:2],
-            *(values.atVector(key) for key in keys[2:]),
-        )
+        miss_m, direction = record.innovation_m(values.atVector)
         if jacobians is not None:
-            towards = (direction @ _POSITION)[None, :]
-            jacobians[0], jacobians[1] = -towards, towards
+            for k, way in enumerate(ways.values()):
+                jacobians[k] = (direction @ way)[None, :]
             if record.clock is not None:
-                jacobians[2] = record.by_clock[None, :]
+                jacobians[len(ways)] = record.by_clock[None, :]
         return np.array([miss_m])
 
-    return _custom(noise, keys, error)
+    return _custom(noise, [*ways, *clocks], error)
 
 
 def _absolute(record: AbsoluteRecord, noise: gtsam.noiseModel.Base) -> gtsam.NonlinearFactor:
-    keys = [record.anchor.key]
+    anchor = record.anchor
 
     def error(_this: object, values: gtsam.Values, jacobians: _Jacobians) -> Array:
         if jacobians is not None:
-            jacobians[0] = _POSITION
-        position_m = values.atVector(keys[0])[:2] + record.anchor.offset_m
-        return np.asarray(position_m - record.position_m)
+            jacobians[0], jacobians[1] = anchor.by_state, -anchor.turning
+        return record.innovation_m(values.atVector)
 
-    return _custom(noise, keys, error)
+    return _custom(noise, [anchor.key, anchor.parameters], error)
+
+
+def _way(origin: Anchor, target: Anchor) -> dict[int, Array]:
+    """Return how the way between two anchors grows with each variable, (2, n) by key."""
+    ways: dict[int, Array] = {}
+    for sign, end in ((-1.0, origin), (1.0, target)):
+        for key, block in ((end.key, end.by_state), (end.parameters, -end.turning)):
+            ways[key] = ways.get(key, 0.0) + sign * block
+    return ways

@@ -4,6 +4,7 @@ Node states are (north, east, bias north, bias east); a vehicle's parameters are
 rad, log scale). Every record computes its own error, in the units of its sigmas.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,20 +19,48 @@ QUARTER_TURN = np.array([[0.0, -1.0], [1.0, 0.0]])
 class Anchor:
     """A node, the offset by dead reckoning from it to the position that is meant, and a lever.
 
-    The lever leads from that position to a place that the sonar saw. Both are told in the frame of
-    the vehicle's own compass, and turn and stretch with its parameters.
+    The offset drifts with the node's bias for lag_s. The lever leads from the position to a place
+    that the sonar saw. Both are told in the frame of the vehicle's own compass, and turn and
+    stretch with its parameters.
     """
 
     key: int
     parameters: int
     offset_m: Array  # (2,)
     time_s: float
+    lag_s: float = 0.0
     lever_m: Array = field(default_factory=lambda: np.zeros(2))  # (2,)
+
+    @property
+    def by_state(self) -> Array:
+        """How the position moves with the node's state, (2, 4)."""
+        return np.hstack([np.eye(2), -self.lag_s * np.eye(2)])
 
     @property
     def turning(self) -> Array:
         """Return by how much the place moves back per radian and unit of the parameters, (2, 2)."""
         return np.column_stack([QUARTER_TURN @ (self.offset_m + self.lever_m), self.offset_m])
+
+    def position_m(self, state: Array, parameters: Array) -> Array:
+        """Return the position (2,) by the node's state (4,) and the vehicle's parameters (2,).
+
+        It is moved by as much as the compass moves the place that was seen along the lever.
+        """
+        return np.asarray(self.by_state @ state + self.offset_m - self.turning @ parameters)
+
+
+def as_reckoned(moved_m: Array, parameters: Array) -> Array:
+    """Return how dead reckoning with a vehicle's parameters (2,) tells of a true way (2,)."""
+    heading_rad, scale = parameters
+    return np.asarray(moved_m + heading_rad * QUARTER_TURN @ moved_m + scale * moved_m)
+
+
+States = Callable[[int], Array]  # tells the estimate of a variable by its key
+
+
+def position_of(anchor: Anchor, states: States) -> Array:
+    """Return the position (2,) of an anchor by an estimate."""
+    return anchor.position_m(states(anchor.key), states(anchor.parameters))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,13 +122,9 @@ class ClosureRecord:
     offset_m: Array
     covariance_m2: Array  # (2, 2)
 
-    def innovation_m(
-        self, origin_m: Array, target_m: Array, parameters: tuple[Array, ...]
-    ) -> Array:
-        """Return estimated minus measured offset (2,) for the nodes' positions and parameters."""
-        origin = origin_m + self.origin.offset_m - self.origin.turning @ parameters[0]
-        target = target_m + self.target.offset_m - self.target.turning @ parameters[1]
-        return np.asarray(target - origin - self.offset_m)
+    def innovation_m(self, states: States) -> Array:
+        """Return estimated minus measured offset (2,)."""
+        return position_of(self.target, states) - position_of(self.origin, states) - self.offset_m
 
 
 def clock_row(time_s: float) -> Array:
@@ -126,14 +151,12 @@ class RangeRecord:
         """How the range grows with the state (2,) of the sender's clock."""
         return clock_row(self.target.time_s)
 
-    def innovation_m(
-        self, origin_m: Array, target_m: Array, clock: Array | None = None
-    ) -> tuple[float, Array]:
+    def innovation_m(self, states: States) -> tuple[float, Array]:
         """Return estimated minus measured range, and the unit vector (2,) from origin to target."""
-        between_m = target_m + self.target.offset_m - origin_m - self.origin.offset_m
+        between_m = position_of(self.target, states) - position_of(self.origin, states)
         distance_m = float(np.hypot(*between_m))
         direction = between_m / distance_m if distance_m > 1e-6 else np.array([1.0, 0.0])
-        late_m = 0.0 if clock is None else float(self.by_clock @ clock)
+        late_m = 0.0 if self.clock is None else float(self.by_clock @ states(self.clock))
         return distance_m + late_m - self.range_m, direction
 
 
@@ -144,6 +167,10 @@ class AbsoluteRecord:
     anchor: Anchor
     position_m: Array
     covariance_m2: Array
+
+    def innovation_m(self, states: States) -> Array:
+        """Return estimated minus measured position (2,)."""
+        return position_of(self.anchor, states) - self.position_m
 
 
 Record = (

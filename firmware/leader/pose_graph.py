@@ -176,7 +176,7 @@ class PoseGraph(Estimate):
         """Make the past coarse, learn how much drift wanders, and restart ISAM2 from the ledger."""
         self.update()
         self._learn_walk(now_s)
-        estimate = {key: state[:2] for key, state in self._states().items()}
+        estimate = self._states()
         pinned, detail_s = pinned_keys(self._ledger.values()), detail_from_s(now_s, settings)
         owners: dict[int, int] = {}
         for vehicle, chain in self._chains.items():

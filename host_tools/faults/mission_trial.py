@@ -42,6 +42,7 @@ _TAKEN = (
     "frames_of_unknown_vehicles",
     "answers_to_others",
     "answers_used",
+    "answers_without_news",
     "answers_gated",
     "answers_stale",
     "answers_restarted_us",
@@ -176,7 +177,8 @@ class MissionTrial:
         if isinstance(program.core, JournaledLeader):
             return sum(sheet.id.vehicle == 1 for sheet in program.core.atlas)
         status = program.core.status()
-        return status["answers_used"] + status["ranges_used"]
+        told = ("answers_used", "answers_without_news", "ranges_used")
+        return sum(status[name] for name in told)
 
     def _look(self) -> None:
         for vehicle, computer in enumerate(self.rig.computers):

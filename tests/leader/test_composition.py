@@ -173,15 +173,7 @@ def test_closure_beyond_its_sigmas_is_not_taken_along() -> None:
     voyage.graph.compose(3600.0, SETTINGS)
     assert number not in voyage.graph
     left = _records(voyage.graph, ClosureRecord)
-    state = voyage.graph._state
-    misses_m = [
-        r.innovation_m(
-            state(r.origin.key)[:2],
-            state(r.target.key)[:2],
-            (state(r.origin.parameters), state(r.target.parameters)),
-        )
-        for r in left
-    ]
+    misses_m = [record.innovation_m(voyage.graph._state) for record in left]
     assert np.hypot(*np.array(misses_m).T).max() < 8.0
 
 

@@ -22,6 +22,7 @@ _WILD_DENSITY = 1e-4  # per metre: multipath from anywhere in the water column
 _GRID_STEP_SIGMAS = 0.5
 _SPREAD_OVER_S = 20.0
 _SHARES = np.array([0.05, 0.2, 0.4, 0.6, 0.8, 0.95])
+_SELDOM, _SELDOM_SHARE = 3.0, 0.1  # times the usual rate, and how often: some drift runs away
 _LONGEST_GRID = 1000  # half-widths: a kilometre of miss at the usual sigma
 
 
@@ -66,9 +67,17 @@ class RangeSettings(Settings):
     bent_m: float = setting(
         0.5, "m", "bend of a range that hides in its noise (1 m, Eq. 13)", minimum=0.01
     )
+    bent_share: float = setting(
+        0.05, "1", "of a range: up to such a bend, a third of it aside, it is used roughly",
+        minimum=0.0, maximum=1.0,
+    )  # fmt: skip
+    bent_alike: float = setting(
+        2.0, "1", "by which bends count more than noise: two minutes of windows bend alike",
+        minimum=1.0,
+    )  # fmt: skip
     waiting: int = setting(64, "windows", "of 20 s that wait until they are understood", minimum=1)
     certainty: float = setting(
-        0.99, "1", "share of belief that one explanation must have", minimum=0.5, maximum=1.0
+        0.995, "1", "share of belief that one explanation must have", minimum=0.5, maximum=1.0
     )
 
 
@@ -112,17 +121,16 @@ class RangeJudge:
         lost_m = float(np.hypot(prior_sigma_m, s.lost_m))
         miss_m = _grid(4.0 * max(prior_sigma_m, 0.5 * lost_m) + 4.0 * sigma_m, sigma_m)
         reach_s = max(float(np.max(np.abs(age_s))), 1e-3)
-        rate_mps = _grid(3.0 * s.rate_sigma_mps, sigma_m / reach_s)
+        seldom_mps = _SELDOM * s.rate_sigma_mps
+        rate_mps = _grid(3.0 * seldom_mps, sigma_m / reach_s)
         as_true, as_stretched = self._densities(
             np.where(sane, measured_m, np.nan)[:, None, None],
             predicted_m[:, None, None] + miss_m[:, None] + age_s[:, None, None] * rate_mps,
             sigma_m,
         )
-        usual, lost = (np.exp(-0.5 * (miss_m / sigma) ** 2) for sigma in (prior_sigma_m, lost_m))
-        log_prior = np.log(
-            (1.0 - s.lost_share) * usual / usual.sum() + s.lost_share * lost / lost.sum()
+        score = _log_prior(miss_m, prior_sigma_m, lost_m, s.lost_share)[:, None] + _log_prior(
+            rate_mps, s.rate_sigma_mps, seldom_mps, _SELDOM_SHARE
         )
-        score = log_prior[:, None] - 0.5 * (rate_mps / s.rate_sigma_mps) ** 2
         score += self._log_likelihood(as_true[sane], as_stretched[sane])
         belief = np.exp(score - score.max())
         i, j = divmod(int(np.argmax(score)), score.shape[1])
@@ -161,6 +169,13 @@ class RangeJudge:
         ]
         weighted = np.stack(by_share) + (log_weight - logsumexp(log_weight))[:, None, None]
         return np.asarray(logsumexp(weighted, axis=0))
+
+
+def _log_prior(values: Array, sigma: float, wide: float, wide_share: float) -> Array:
+    """Return the log belief (N,) in values on a grid, of which a share is spread more widely."""
+    usual, seldom = (np.exp(-0.5 * (values / width) ** 2) for width in (sigma, wide))
+    belief = (1.0 - wide_share) * usual / usual.sum() + wide_share * seldom / seldom.sum()
+    return np.asarray(np.log(belief))
 
 
 def _grid(reach: float, sigma: float) -> Array:

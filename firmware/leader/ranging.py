@@ -2,13 +2,14 @@
 
 import enum
 from collections import Counter, deque
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from firmware.leader.ledger import Anchor
 from firmware.leader.pose_graph import PoseGraph
-from firmware.leader.ranges import RangeJudge, RangeSettings
+from firmware.leader.ranges import RangeJudge, RangeSettings, RangeVerdict
 from firmware.submaps import Track
 from protocol.errors import EstimationError
 from protocol.packets import Header
@@ -42,10 +43,20 @@ class _PlacedRange:
     direction: np.ndarray  # (2,) unit vector from here to there
 
 
+@dataclass(slots=True)
+class _Window:
+    """Ranges that are judged together, and what was entered of them while they were too bent."""
+
+    held: list[_HeldRange]
+    entered: list[int] = field(default_factory=list)  # numbers of the ledger
+    bent_m: float = np.inf
+
+
 class _Fate(enum.Enum):
     """What became of a window that was judged."""
 
     ENTERED = enum.auto()
+    ROUGHLY = enum.auto()  # and it waits to be entered anew
     BENT = enum.auto()
     UNDECIDED = enum.auto()
 
@@ -58,7 +69,7 @@ class Ranging:
         self._settings = settings
         self._judge = RangeJudge(settings)
         self._held: deque[_HeldRange] = deque(maxlen=settings.held)
-        self._waiting: dict[int, deque[list[_HeldRange]]] = {}
+        self._waiting: dict[int, deque[_Window]] = {}
 
     def hold(self, chain: int, header: Header, toa_s: float) -> None:
         """Keep the range that a frame's arrival tells, until its sender's track is known.
@@ -82,9 +93,10 @@ class Ranging:
     ) -> None:
         """Judge, by windows, the held ranges whose both ends are known; enter the good ones.
 
-        While the vehicles may lie so far across the line of sight that a range bends, or while two
-        explanations of a window compete, it waits, and the next one joins it. Once a window is
-        understood, those that wait are tried again, newest first.
+        While two explanations of a window compete it waits, and the next one joins it. While the
+        vehicles may lie so far across the line of sight that a range bends, it is used roughly at
+        most, and waits as well. Once a window is understood, those that wait are tried again,
+        newest first.
         """
         end_s = float(track.time_s[-1])
         ready = [r for r in self._held if r.chain == chain and r.sent_s <= end_s]
@@ -95,29 +107,34 @@ class Ranging:
         waiting = self._waiting.setdefault(chain, deque())
         for held in ready:
             self._join(waiting, held)
-        still: deque[list[_HeldRange]] = deque()
+        still: deque[_Window] = deque()
         while waiting:
             window = waiting.pop()
-            placed = self._placed(window, (receiver, receiver_track), (chain, track), graph)
-            fate = self._enter(placed, graph) if placed else _Fate.ENTERED
-            if fate is _Fate.ENTERED:
+            placed = self._placed(window.held, (receiver, receiver_track), (chain, track), graph)
+            fate = self._enter(window, placed, graph) if placed else _Fate.ENTERED
+            if fate in (_Fate.ENTERED, _Fate.ROUGHLY):
                 graph.update()
-                continue
-            still.appendleft(window)
+            if fate is not _Fate.ENTERED:
+                still.appendleft(window)
             if fate is _Fate.BENT:
                 break
         waiting.extend(still)
 
-    def _join(self, waiting: deque[list[_HeldRange]], held: _HeldRange) -> None:
+    def _join(self, waiting: deque[_Window], held: _HeldRange) -> None:
         """Let a range wait with the newest window, or begin a new one; bounded."""
         s = self._settings
-        newest = waiting[-1] if waiting else []
-        if newest and held.sent_s - newest[0].sent_s <= s.joined_s and len(newest) < s.joined:
-            newest.append(held)
+        newest = waiting[-1] if waiting else None
+        if (
+            newest is not None
+            and not newest.entered
+            and held.sent_s - newest.held[0].sent_s <= s.joined_s
+            and len(newest.held) < s.joined
+        ):
+            newest.held.append(held)
             return
-        waiting.append([held])
+        waiting.append(_Window([held]))
         if len(waiting) > s.waiting:
-            self.counters["ranges_given_up"] += len(waiting.popleft())
+            self.counters["ranges_given_up"] += len(waiting.popleft().held)
 
     def _placed(
         self,
@@ -136,10 +153,18 @@ class Ranging:
                 self.counters["ranges_unplaceable"] += 1
         return placed
 
-    def _enter(self, placed: list[_PlacedRange], graph: PoseGraph) -> _Fate:
-        """Enter what can be believed of a window, unless it has to wait."""
-        along_m, bent_m = _spread(placed[len(placed) // 2], graph)
-        if bent_m > self._settings.bent_m:
+    def _enter(self, window: _Window, placed: list[_PlacedRange], graph: PoseGraph) -> _Fate:
+        """Enter what can be believed of a window, unless it has to wait.
+
+        One whose bend does not hide in its noise is entered as roughly as it bends, and anew once
+        it bends half as much. What was composed with other ranges meanwhile stays as it is.
+        """
+        if not all(number in graph for number in window.entered):
+            return _Fate.ENTERED
+        s, middle = self._settings, placed[len(placed) // 2]
+        along_m, bent_m = _spread(middle, graph)
+        roughly = bent_m > s.bent_m
+        if roughly and bent_m > min(0.5 * window.bent_m, s.bent_share * middle.predicted_m):
             return _Fate.BENT
         verdict = self._judge.judge(
             np.array([p.range_m - p.clock_m for p in placed]),
@@ -149,19 +174,31 @@ class Ranging:
         )
         if not verdict.certain:
             return _Fate.UNDECIDED
-        for k, p in enumerate(placed):
-            if verdict.true[k]:
-                range_m = p.range_m
-                self.counters["ranges_used"] += 1
-            elif verdict.stretched[k]:
-                way_m = (p.range_m - p.clock_m) / self._settings.outlier_factor
-                range_m = p.clock_m + way_m
-                self.counters["ranges_unstretched"] += 1
-            else:
-                self.counters["ranges_rejected"] += 1
-                continue
-            graph.add_range(p.here, p.there, range_m, bent_m, sender=p.sender)
+        for number in window.entered:
+            graph.set_active(number, active=False)
+        alike = s.bent_alike * np.sqrt(len(placed)) if roughly else 1.0
+        window.bent_m = bent_m
+        window.entered = [
+            graph.add_range(p.here, p.there, range_m, float(alike * bent_m), sender=p.sender)
+            for p, range_m in self._believed(placed, verdict)
+        ]
+        if roughly:
+            self.counters["ranges_used_roughly"] += len(window.entered)
+            return _Fate.ROUGHLY
+        self.counters["ranges_used"] += int(verdict.true.sum())
+        self.counters["ranges_unstretched"] += int(verdict.stretched.sum())
+        self.counters["ranges_rejected"] += len(placed) - len(window.entered)
         return _Fate.ENTERED
+
+    def _believed(
+        self, placed: list[_PlacedRange], verdict: RangeVerdict
+    ) -> Iterator[tuple[_PlacedRange, float]]:
+        """Yield the ranges that are believed, and how long they are without their stretch."""
+        for p, true, stretched in zip(placed, verdict.true, verdict.stretched, strict=True):
+            if true:
+                yield p, p.range_m
+            elif stretched:
+                yield p, p.clock_m + (p.range_m - p.clock_m) / self._settings.outlier_factor
 
 
 def _spread(placed: _PlacedRange, graph: PoseGraph) -> tuple[float, float]:

@@ -5,6 +5,7 @@ import pytest
 
 from firmware.geometry import Array
 from firmware.leader.graph_settings import GraphSettings
+from firmware.leader.ledger import Anchor, RangeRecord
 from firmware.leader.pose_graph import PoseGraph
 from firmware.leader.ranges import RangeSettings
 from firmware.leader.ranging import Ranging
@@ -53,12 +54,21 @@ class Pair:
 
     def chi_square(self, now_s: int) -> float:
         """Return the squared error of the relative position, in units of its covariance."""
-        ends = [self.graph.anchor(v, float(now_s), self.track(v, now_s + 1)) for v in (0, 1)]
         between = np.hstack([-np.eye(2), np.eye(2)])
-        covariance_m2 = between @ self.graph.covariance(ends) @ between.T
-        estimated_m = self.graph.position(ends[1]) - self.graph.position(ends[0])
-        error_m = estimated_m - (self.true_m[1] - self.true_m[0])[now_s]
+        covariance_m2 = between @ self.graph.covariance(self._ends(now_s)) @ between.T
+        error_m = self._error_m(now_s)
         return float(error_m @ np.linalg.solve(covariance_m2, error_m))
+
+    def error_m(self, now_s: int) -> float:
+        """Return how far the relative position is off."""
+        return float(np.hypot(*self._error_m(now_s)))
+
+    def _ends(self, now_s: int) -> list[Anchor]:
+        return [self.graph.anchor(v, float(now_s), self.track(v, now_s + 1)) for v in (0, 1)]
+
+    def _error_m(self, now_s: int) -> Array:
+        estimated_m = self.graph.offset(*self._ends(now_s))
+        return np.asarray(estimated_m - (self.true_m[1] - self.true_m[0])[now_s])
 
     def _hear(self, now_s: int, range_m: float) -> None:
         header = Header(
@@ -79,3 +89,21 @@ def test_ranges_alone_choose_no_side_of_the_line(seed: int) -> None:
     pair = Pair(seed)
     assert pair.ranging.counters["ranges_used"] > 20
     assert pair.chi_square(600) < 13.8  # 99.9 % of two degrees of freedom
+
+
+def test_ranges_tell_while_they_bend() -> None:
+    """Dead reckoning alone is between 110 and 280 m off, one pair against the other."""
+    pairs = [Pair(seed) for seed in range(10)]
+    assert np.median([pair.error_m(600) for pair in pairs]) < 10.0
+    assert any(pair.ranging.counters["ranges_used_roughly"] for pair in pairs)
+    assert max(pair.chi_square(600) for pair in pairs) < 13.8
+
+
+def test_range_that_bends_is_entered_once_at_a_time() -> None:
+    pair = Pair(3)
+    active = [
+        (record.origin.time_s, record.target.time_s)
+        for entry in pair.graph._ledger.values()
+        if entry.active and isinstance(record := entry.record, RangeRecord)
+    ]
+    assert len(active) == len(set(active))

@@ -39,11 +39,11 @@ def test_window_that_stays_undecided_does_not_hold_up_older_ones(
     fates = {8: _Fate.BENT, 104: _Fate.UNDECIDED, 200: _Fate.ENTERED}
     tried: list[int] = []
 
-    def placed(_self: Ranging, window: list[object], *_: object) -> list[object]:
-        return window
+    def placed(_self: Ranging, held: list[object], *_: object) -> list[object]:
+        return held
 
-    def enter(_self: Ranging, window: list[MagicMock], _graph: object) -> _Fate:
-        begin_s = max(s for s in fates if s <= window[0].sent_s)
+    def enter(_self: Ranging, _window: object, held: list[MagicMock], _graph: object) -> _Fate:
+        begin_s = max(s for s in fates if s <= held[0].sent_s)
         tried.append(begin_s)
         return fates[begin_s]
 
@@ -58,17 +58,17 @@ def test_window_that_stays_undecided_does_not_hold_up_older_ones(
     _heard(ranging, 200, 250)
     ranging.use(1, _track(250), 0, _track(250), graph)
     assert tried == [200, 104, 8]
-    assert [window[0].sent_s for window in ranging._waiting[1]] == [104]
+    assert [window.held[0].sent_s for window in ranging._waiting[1]] == [104]
 
 
 def test_no_window_grows_without_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     sizes: list[int] = []
 
-    def enter(_self: Ranging, window: list[object], _graph: object) -> _Fate:
-        sizes.append(len(window))
+    def enter(_self: Ranging, _window: object, held: list[object], _graph: object) -> _Fate:
+        sizes.append(len(held))
         return _Fate.UNDECIDED
 
-    monkeypatch.setattr(Ranging, "_placed", lambda _self, window, *_: window)
+    monkeypatch.setattr(Ranging, "_placed", lambda _self, held, *_: held)
     monkeypatch.setattr(Ranging, "_enter", enter)
     settings = RangeSettings(waiting=3)
     ranging = Ranging(settings)

@@ -163,6 +163,18 @@ def test_graph_with_news_is_not_written_down() -> None:
         pickle.dumps(voyage.graph)
 
 
+def test_anchor_in_the_composed_past_lies_on_the_estimated_track() -> None:
+    voyage = Voyage(None).run(0, 3600)
+    voyage.graph.compose(3600.0, SETTINGS)
+    track, _ = voyage.tracks[0]
+    assert np.abs(voyage.graph.parameters(0)).min() > 1e-4
+    for time_s in (613.0, 905.0):
+        anchor = voyage.graph.anchor(0, time_s, track)
+        assert np.hypot(*anchor.offset_m) > 5.0
+        lies_m = voyage.graph.trajectory(0).correct(time_s, track.position_at(time_s))
+        assert voyage.graph.position(anchor) == pytest.approx(lies_m, abs=5e-3)
+
+
 def test_closure_beyond_its_sigmas_is_not_taken_along() -> None:
     voyage = Voyage(None).run(0, 3600)
     track, true_m = voyage.tracks[0]

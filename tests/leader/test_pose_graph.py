@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from firmware.leader.graph_settings import GraphSettings
-from firmware.leader.ledger import OdometryRecord, PriorRecord, RangeRecord, SharedDriftRecord
+from firmware.leader.ledger import (
+    Anchor,
+    OdometryRecord,
+    PriorRecord,
+    RangeRecord,
+    SharedDriftRecord,
+)
 from firmware.leader.pose_graph import PoseGraph
 from firmware.submaps import Track
 from protocol.errors import EstimationError
@@ -161,6 +167,32 @@ def test_current_that_turns_for_one_vehicle_turns_for_the_other() -> None:
         graph.update()
         misses_m.append(float(np.abs(graph.trajectory(1).position_m[-1, 0])))
     assert misses_m[0] < 0.5 * misses_m[1]
+
+
+def test_range_says_nothing_of_a_compass_that_turns_the_whole_map() -> None:
+    """Nodes turned by an angle, and the compass by as much: the way between instants turns too."""
+    turn_rad = np.radians(1.0)
+    turned = np.array([[np.cos(turn_rad), -np.sin(turn_rad)], [np.sin(turn_rad), np.cos(turn_rad)]])
+    states = {1: np.array([30.0, -20.0, 0.2, 0.1]), 2: np.array([-60.0, 70.0, -0.1, 0.2])}
+    ends = [
+        Anchor(key=key, parameters=9, offset_m=np.array(offset_m), time_s=4.0, lag_s=4.0)
+        for key, offset_m in ((1, [8.0, 3.0]), (2, [-2.0, 9.0]))
+    ]
+    record = RangeRecord(origin=ends[0], target=ends[1], range_m=100.0, sigma_m=1.0)
+    misses_m = []
+    for turn, heading_rad in ((np.eye(2), 0.0), (turned, -turn_rad), (turned, 0.0)):
+        values = {key: np.concatenate([turn @ s[:2], turn @ s[2:]]) for key, s in states.items()}
+        values[9] = np.array([heading_rad, 0.0])
+        misses_m.append(record.innovation_m(values.__getitem__)[0])
+    assert misses_m[1] == pytest.approx(misses_m[0], abs=2e-3)
+    assert abs(misses_m[2] - misses_m[0]) > 0.03
+
+
+def test_between_nodes_drift_makes_a_position_less_sure() -> None:
+    track, _ = walk(np.random.default_rng(5), 3, 0.0)
+    graph = started(track)
+    sigma_m = float(np.sqrt(graph.covariance([graph.anchor(0, 3.0, track)])[1, 1]))
+    assert sigma_m == pytest.approx(np.hypot(0.5, 3.0 * 0.2), rel=0.01)
 
 
 def test_closures_between_lines_do_not_vouch_for_the_compass() -> None:

@@ -236,15 +236,16 @@ class Composition:
         )
 
     def _one_range(self, records: list[RangeRecord]) -> RangeRecord:
-        """Return the one in the middle with the mean of all innovations."""
+        """Return the one in the middle with the weighted mean of all innovations."""
         middle = records[len(records) // 2]
+        weights = np.array([record.sigma_m**-2 for record in records])
         innovations_m = [r.innovation_m(self._estimate.__getitem__)[0] for r in records]
-        own_m = innovations_m[len(records) // 2]
-        sigma_m = float(np.sqrt(np.sum([r.sigma_m**2 for r in records])) / len(records))
+        mean_m = float(np.average(innovations_m, weights=weights))
+        least_m = min(self._settings.range_floor_m, *(record.sigma_m for record in records))
         return replace(
             middle,
-            range_m=middle.range_m + own_m - float(np.mean(innovations_m)),
-            sigma_m=max(sigma_m, min(self._settings.range_floor_m, middle.sigma_m)),
+            range_m=middle.range_m + innovations_m[len(records) // 2] - mean_m,
+            sigma_m=max(float(weights.sum() ** -0.5), least_m),
         )
 
 

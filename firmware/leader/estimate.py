@@ -122,7 +122,7 @@ class Estimate:
         return float(row @ self._state(key)), float(np.sqrt(variance_m2))
 
     def position(self, anchor: Anchor) -> Array:
-        """Return the estimated position (2,) of an anchor."""
+        """Return the estimated position (2,) of an anchor; with a lever, as a closure sees it."""
         return position_of(anchor, self._state)
 
     def offset(self, origin: Anchor, target: Anchor) -> Array:
@@ -155,30 +155,15 @@ class Estimate:
 
         Raises EstimationError if the information matrix is singular.
         """
-        nodes = list(dict.fromkeys(anchor.key for anchor in anchors))
-        parameters = list(dict.fromkeys(anchor.parameters for anchor in anchors))
-        self.update()
-        joint = self._solver.covariance([*nodes, *parameters])
-        rows = np.zeros((len(anchors), 2, len(joint)))
-        for row, anchor in zip(rows, anchors, strict=True):
-            node = 4 * nodes.index(anchor.key)
-            row[:, node : node + 4] = anchor.by_state
-            calibration = 4 * len(nodes) + 2 * parameters.index(anchor.parameters)
-            row[:, calibration : calibration + 2] = -anchor.turning
-        by_all = rows.reshape(-1, len(joint))
-        return np.asarray(by_all @ joint @ by_all.T)
+        positions_m2 = self.state_covariance(anchors)[:, _POSITION, :, _POSITION]
+        return np.asarray(positions_m2.reshape(2 * len(anchors), 2 * len(anchors)))
 
     def state_covariance(self, anchors: list[Anchor]) -> Array:
         """Return the joint covariance (A, 4, A, 4) of positions in m and drifts in m/s of anchors.
 
         Raises EstimationError if the information matrix is singular.
         """
-        keys = list(dict.fromkeys(anchor.key for anchor in anchors))
-        node = {key: k for k, key in enumerate(keys)}
-        nodes = [node[anchor.key] for anchor in anchors]
-        self.update()
-        joint = self._solver.covariance(keys).reshape(len(keys), 4, len(keys), 4)
-        return np.asarray(joint[nodes][:, :, nodes])
+        return self._anchored_covariance([], anchors).reshape(len(anchors), 4, len(anchors), 4)
 
     def predicted_covariance(self, vehicle: int, time_s: float) -> Array:
         """Return the covariance (2, 2) in m^2 of a vehicle's position at or after its last node."""
@@ -207,13 +192,11 @@ class Estimate:
 
         It is (4V + 2A, 4V + 2A). Raises EstimationError if the information matrix is singular.
         """
-        self.update()
         newest = [self._chains[vehicle].keys[-1] for vehicle in vehicles]
-        keys = list(dict.fromkeys([*newest, *(anchor.key for anchor in anchors)]))
-        joint = self._solver.covariance(keys)
-        first = dict(zip(keys, range(0, 4 * len(keys), 4), strict=True))
-        rows = [first[key] + k for key in newest for k in range(4)]
-        rows += [first[anchor.key] + axis for anchor in anchors for axis in (0, 1)]
+        joint = self._anchored_covariance(newest, anchors)
+        states = 4 * len(newest)
+        positions = states + (4 * np.arange(len(anchors))[:, None] + [0, 1]).ravel()
+        rows = np.concatenate([np.arange(states), positions])
         return np.asarray(joint[np.ix_(rows, rows)])
 
     def drift_changes(self, now_s: float) -> list[DriftChange]:
@@ -254,6 +237,24 @@ class Estimate:
             for key in (*chain.keys, chain.parameters, chain.clock)
             if key is not None
         }
+
+    def _anchored_covariance(self, nodes: list[int], anchors: list[Anchor]) -> Array:
+        """Return the joint covariance of the states (4,) of nodes and then of anchors."""
+        keys = list(dict.fromkeys([*nodes, *(anchor.key for anchor in anchors)]))
+        parameters = list(dict.fromkeys(anchor.parameters for anchor in anchors))
+        self.update()
+        joint = self._solver.covariance([*keys, *parameters])
+        rows = np.zeros((len(nodes) + len(anchors), 4, len(joint)))
+        for row, key in zip(rows, [*nodes, *(anchor.key for anchor in anchors)], strict=True):
+            first = 4 * keys.index(key)
+            row[:, first : first + 4] = np.eye(4)
+        for row, anchor in zip(rows[len(nodes) :], anchors, strict=True):
+            first = 4 * keys.index(anchor.key)
+            row[_POSITION, first : first + 4] = anchor.by_state
+            first = 4 * len(keys) + 2 * parameters.index(anchor.parameters)
+            row[_POSITION, first : first + 2] = -anchor.turning
+        by_all = rows.reshape(-1, len(joint))
+        return np.asarray(by_all @ joint @ by_all.T)
 
     def _joint_covariance(
         self, keys: list[int], part: slice = _POSITION, *, reckoned: bool = False

@@ -52,7 +52,7 @@ class Anchor:
 def as_reckoned(moved_m: Array, parameters: Array) -> Array:
     """Return how dead reckoning with a vehicle's parameters (2,) tells of a true way (2,)."""
     heading_rad, scale = parameters
-    return np.asarray(moved_m + heading_rad * QUARTER_TURN @ moved_m + scale * moved_m)
+    return np.linalg.solve((1.0 - scale) * np.eye(2) - heading_rad * QUARTER_TURN, moved_m)
 
 
 States = Callable[[int], Array]  # tells the estimate of a variable by its key

@@ -68,7 +68,7 @@ class RangeSettings(Settings):
         0.5, "m", "bend of a range that hides in its noise (1 m, Eq. 13)", minimum=0.01
     )
     bent_share: float = setting(
-        0.05, "1", "of a range: up to such a bend, a third of it aside, it is used roughly",
+        0.05, "1", "of a range: up to such a bend, a quarter of it aside, it is used roughly",
         minimum=0.0, maximum=1.0,
     )  # fmt: skip
     bent_alike: float = setting(
@@ -122,7 +122,7 @@ class RangeJudge:
         miss_m = _grid(4.0 * max(prior_sigma_m, 0.5 * lost_m) + 4.0 * sigma_m, sigma_m)
         reach_s = max(float(np.max(np.abs(age_s))), 1e-3)
         seldom_mps = _SELDOM * s.rate_sigma_mps
-        rate_mps = _grid(3.0 * seldom_mps, sigma_m / reach_s)
+        rate_mps = _grid(2.0 * seldom_mps, sigma_m / reach_s)
         as_true, as_stretched = self._densities(
             np.where(sane, measured_m, np.nan)[:, None, None],
             predicted_m[:, None, None] + miss_m[:, None] + age_s[:, None, None] * rate_mps,
@@ -142,10 +142,12 @@ class RangeJudge:
         total = reads_true + reads_stretched + _WILD_DENSITY
         true = sane & (reads_true > 0.9 * total)
         stretched = sane & (reads_stretched > 0.9 * total)
-        if certain:
-            self._seen["true"] += float(np.count_nonzero(true))
-            self._seen["stretched"] += float(np.count_nonzero(stretched))
         return RangeVerdict(true=true, stretched=stretched, certain=certain)
+
+    def learn(self, verdict: RangeVerdict) -> None:
+        """Learn the share of stretched ranges from a verdict, once for each window."""
+        self._seen["true"] += float(np.count_nonzero(verdict.true))
+        self._seen["stretched"] += float(np.count_nonzero(verdict.stretched))
 
     def _densities(
         self, measured_m: Array, expected_m: Array, sigma_m: float

@@ -51,6 +51,11 @@ class _Window:
     entered: list[int] = field(default_factory=list)  # numbers of the ledger
     bent_m: float = np.inf
 
+    @property
+    def is_judged(self) -> bool:
+        """Whether it was once entered, or all of it rejected."""
+        return self.bent_m < np.inf
+
 
 class _Fate(enum.Enum):
     """What became of a window that was judged."""
@@ -126,7 +131,7 @@ class Ranging:
         newest = waiting[-1] if waiting else None
         if (
             newest is not None
-            and not newest.entered
+            and not newest.is_judged
             and held.sent_s - newest.held[0].sent_s <= s.joined_s
             and len(newest.held) < s.joined
         ):
@@ -134,7 +139,9 @@ class Ranging:
             return
         waiting.append(_Window([held]))
         if len(waiting) > s.waiting:
-            self.counters["ranges_given_up"] += len(waiting.popleft().held)
+            oldest = waiting.popleft()
+            fate = "ranges_left_rough" if oldest.entered else "ranges_given_up"
+            self.counters[fate] += len(oldest.held)
 
     def _placed(
         self,
@@ -157,9 +164,11 @@ class Ranging:
         """Enter what can be believed of a window, unless it has to wait.
 
         One whose bend does not hide in its noise is entered as roughly as it bends, and anew once
-        it bends half as much. What was composed with other ranges meanwhile stays as it is.
+        it bends half as much; that verdict rests on the first one to a small part. What was
+        composed with other ranges meanwhile stays as it is.
         """
         if not all(number in graph for number in window.entered):
+            self.counters["ranges_left_rough"] += len(placed)
             return _Fate.ENTERED
         s, middle = self._settings, placed[len(placed) // 2]
         along_m, bent_m = _spread(middle, graph)
@@ -176,14 +185,16 @@ class Ranging:
             return _Fate.UNDECIDED
         for number in window.entered:
             graph.set_active(number, active=False)
-        alike = s.bent_alike * np.sqrt(len(placed)) if roughly else 1.0
+        if not window.is_judged:
+            self._judge.learn(verdict)
+            self.counters["ranges_used_roughly"] += len(placed) if roughly else 0
+        spread_m = bent_m * float(s.bent_alike * np.sqrt(len(placed))) if roughly else bent_m
         window.bent_m = bent_m
         window.entered = [
-            graph.add_range(p.here, p.there, range_m, float(alike * bent_m), sender=p.sender)
+            graph.add_range(p.here, p.there, range_m, spread_m, sender=p.sender)
             for p, range_m in self._believed(placed, verdict)
         ]
         if roughly:
-            self.counters["ranges_used_roughly"] += len(window.entered)
             return _Fate.ROUGHLY
         self.counters["ranges_used"] += int(verdict.true.sum())
         self.counters["ranges_unstretched"] += int(verdict.stretched.sum())

@@ -163,6 +163,25 @@ def test_graph_with_news_is_not_written_down() -> None:
         pickle.dumps(voyage.graph)
 
 
+def test_rough_range_takes_nothing_from_the_sharp_ones_beside_it() -> None:
+    voyage = Voyage(None).run(0, 600)
+    (own, own_m), (other, other_m) = voyage.tracks
+    graph, ends_s = voyage.graph, (301.0, 302.0, 303.0)
+    apart_m = [float(np.hypot(*(other_m[int(t)] - own_m[int(t)]))) for t in ends_s]
+    for time_s, true_m, miss_m, spread_m in zip(
+        ends_s, apart_m, (0.0, 0.0, 60.0), (0.0, 0.0, 60.0), strict=True
+    ):
+        ends = graph.anchor(0, time_s, own), graph.anchor(1, time_s, other)
+        graph.add_range(*ends, true_m + miss_m, spread_m)
+    graph.update()
+    graph.compose(3000.0, SETTINGS)
+    (composed,) = [
+        record for record in _records(graph, RangeRecord) if 240.0 < record.target.time_s < 480.0
+    ]
+    assert composed.sigma_m < 1.5
+    assert abs(composed.innovation_m(graph._state)[0]) < 1.5
+
+
 def test_anchor_in_the_composed_past_lies_on_the_estimated_track() -> None:
     voyage = Voyage(None).run(0, 3600)
     voyage.graph.compose(3600.0, SETTINGS)
@@ -172,7 +191,7 @@ def test_anchor_in_the_composed_past_lies_on_the_estimated_track() -> None:
         anchor = voyage.graph.anchor(0, time_s, track)
         assert np.hypot(*anchor.offset_m) > 5.0
         lies_m = voyage.graph.trajectory(0).correct(time_s, track.position_at(time_s))
-        assert voyage.graph.position(anchor) == pytest.approx(lies_m, abs=5e-3)
+        assert voyage.graph.position(anchor) == pytest.approx(lies_m, abs=1e-6)
 
 
 def test_closure_beyond_its_sigmas_is_not_taken_along() -> None:

@@ -132,9 +132,10 @@ def test_pair_whose_hint_was_composed_away_is_passed_over(atlas: Atlas, graph: P
 
 
 def _two_sheets() -> tuple[Sheet, Sheet]:
+    """Return two sheets, 80 s apart, whose middles lie between the nodes of the graph."""
     first, second = (
         dataclasses.replace(_sheet(k, time_s), track=_long_track())
-        for k, time_s in ((1, 20.0), (2, 100.0))
+        for k, time_s in ((1, 22.0), (2, 102.0))
     )
     return first, second
 
@@ -167,7 +168,7 @@ def test_what_the_pair_itself_has_told_does_not_make_it_better_known(graph: Pose
     assert after.prior_covariance_m2 == pytest.approx(
         before.prior_covariance_m2, rel=1e-3, abs=1e-3
     )
-    assert after.prior_shift_m == pytest.approx(before.prior_shift_m, abs=1e-2)
+    assert after.prior_shift_m == pytest.approx(before.prior_shift_m, abs=5e-2)
     assert _looks(graph, before.prior_sigma_m, hint) == []
 
 

@@ -28,6 +28,7 @@ def test_stretched_ranges_are_told_apart_under_both_readings_of_eq_14(share: flo
         measured_m, predicted_m, stretched = window(rng, share, rng.normal(0, 5))
         verdict = judge.judge(measured_m, predicted_m, TIMES_S, 5.0)
         if verdict.certain:
+            judge.learn(verdict)
             used = verdict.true | verdict.stretched
             right += int(np.sum(verdict.stretched[used] == stretched[used]))
             total += int(used.sum())
@@ -77,5 +78,6 @@ def test_lost_prediction_is_told_from_a_window_of_stretched_ranges() -> None:
     for _ in range(5):
         measured_m, predicted_m, stretched = window(rng, 0.2, 30.0)
         verdict = judge.judge(measured_m, predicted_m, TIMES_S, 2.0)
+        judge.learn(verdict)
         assert verdict.certain
         assert verdict.stretched.tolist() == stretched.tolist()

@@ -23,8 +23,7 @@ from firmware.leader.fixes import Fixes
 from firmware.leader.fleet import Fleet
 from firmware.leader.ledger import Anchor
 from firmware.leader.loop_closing import LoopClosing
-from firmware.leader.match_jobs import SheetJobs
-from firmware.leader.matching import MatchOutcome
+from firmware.leader.match_jobs import Findings, SheetJobs
 from firmware.leader.offsets import corrections
 from firmware.leader.outlook import Outlook
 from firmware.leader.own_grid import grid_of
@@ -154,9 +153,9 @@ class LeaderCore:
         """Return the matches of the oldest sheet that still waits for them, or None."""
         return self._closing.next_jobs()
 
-    def finish(self, done: SheetJobs, outcomes: list[MatchOutcome], now_s: float) -> None:
+    def finish(self, done: SheetJobs, findings: Findings, now_s: float) -> None:
         """Judge what the matches of one sheet found, and bring the estimate up to it."""
-        self._closing.finish(done, outcomes, now_s)
+        self._closing.finish(done, findings, now_s)
 
     # what goes out
 

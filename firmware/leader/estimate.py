@@ -19,6 +19,7 @@ from firmware.leader.ledger import (
     clock_row,
     position_of,
 )
+from firmware.leader.nonconvexity import Doubt
 from firmware.leader.solver import Solver
 from firmware.leader.trajectory import Trajectory
 from firmware.leader.wander import DriftChange, Wandering, changes_of
@@ -142,6 +143,21 @@ class Estimate:
     def innovation(self, number: int) -> Array:
         """Return estimated minus measured offset (2,) of a closure, in metres."""
         return self.closure(number).innovation_m(self._state)
+
+    def doubt(self, numbers: list[int], chi_square: float) -> Doubt:
+        """Return closures as false beyond a chi square, or not, by all else that is believed."""
+        doubted = {number: self.closure(number) for number in numbers}
+        return Doubt(
+            believed=tuple(
+                entry.record
+                for number, entry in self._ledger.items()
+                if entry.active and number not in doubted
+            ),
+            doubted=doubted,
+            estimate=self._states(),
+            robust_kernel=self._settings.robust_kernel,
+            chi_square=chi_square,
+        )
 
     def chi_square(self, number: int) -> float:
         """Return the squared innovation of a closure in units of its covariance."""

@@ -10,7 +10,7 @@ import dataclasses
 import json
 import logging
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from firmware.dead_reckoning import ReckonedState
 from firmware.inputs import Heard, Kind, from_state, to_instant, to_state
 from firmware.journal import Journal
 from firmware.leader.core import LeaderCore
-from firmware.leader.match_jobs import SheetJobs
+from firmware.leader.match_jobs import Findings, SheetJobs
 from firmware.leader.matches import Hint, Match, MatchOutcome, NoMatch
 from firmware.leader.settings import LeaderSettings
 from firmware.recorder import Recorder
@@ -95,11 +95,11 @@ class JournaledLeader(LeaderCore):
             self.recorder.note(Kind.JOBS)
         return jobs
 
-    def finish(self, done: SheetJobs, outcomes: list[MatchOutcome], now_s: float) -> None:
+    def finish(self, done: SheetJobs, findings: Findings, now_s: float) -> None:
         """Record what the matches found, and judge it as a replay will."""
-        body = from_outcomes(outcomes, now_s)
+        body = from_findings(findings, now_s)
         self.recorder.note(Kind.OUTCOMES, body)
-        super().finish(done, to_outcomes(body)[0], now_s)
+        super().finish(done, to_findings(body)[0], now_s)
 
     def poll(self, now_s: float) -> bytes | None:
         """Return the answer to transmit now, or None; what led to it is on disk."""
@@ -183,26 +183,28 @@ class JournaledLeader(LeaderCore):
                 jobs = super().next_jobs()
                 self._unfinished = [] if jobs is None else [jobs]
             case Kind.OUTCOMES:
-                outcomes, now_s = to_outcomes(body)
-                super().finish(self._unfinished.pop(), outcomes, now_s)
+                findings, now_s = to_findings(body)
+                super().finish(self._unfinished.pop(), findings, now_s)
             case _:
                 raise StoreUnusableError(f"a leader has no input of kind {kind}")
 
 
-def from_outcomes(outcomes: Sequence[MatchOutcome], now_s: float) -> bytes:
-    """Return outcomes and the time of their judgement as bytes; numbers read back exactly."""
+def from_findings(findings: Findings, now_s: float) -> bytes:
+    """Return findings and the time of their judgement as bytes; numbers read back exactly."""
     rows = [
         (_columns(o.match), _columns(o.hint), None if o.reason is None else o.reason.name)
-        for o in outcomes
+        for o in findings.outcomes
     ]
-    return _NOW.pack(now_s) + json.dumps(rows, separators=(",", ":")).encode()
+    plain = (rows, findings.false_closures)
+    return _NOW.pack(now_s) + json.dumps(plain, separators=(",", ":")).encode()
 
 
-def to_outcomes(body: bytes) -> tuple[list[MatchOutcome], float]:
-    """Return the outcomes and the time of bytes."""
+def to_findings(body: bytes) -> tuple[Findings, float]:
+    """Return the findings and the time of bytes."""
     (now_s,) = _NOW.unpack_from(body)
     outcomes = []
-    for found, hint, reason in json.loads(body[_NOW.size :]):
+    rows, false_closures = json.loads(body[_NOW.size :])
+    for found, hint, reason in rows:
         outcomes.append(
             MatchOutcome(
                 match=None if found is None else Match(**_values(found)),
@@ -210,7 +212,7 @@ def to_outcomes(body: bytes) -> tuple[list[MatchOutcome], float]:
                 hint=None if hint is None else Hint(**_values(hint)),
             )
         )
-    return outcomes, now_s
+    return Findings(outcomes=outcomes, false_closures=false_closures), now_s
 
 
 def _columns(found: Match | Hint | None) -> dict[str, object] | None:

@@ -25,6 +25,7 @@ from firmware.leader.consistency import (
 )
 from firmware.leader.map_vote import VoteSettings, VoteWindow, carried, vote
 from firmware.leader.matching import MatchingSettings
+from firmware.leader.nonconvexity import Doubt
 from firmware.leader.pairing import Calibrations, side_of
 from firmware.leader.pose_graph import PoseGraph
 from protocol.settings import Settings, setting
@@ -70,6 +71,7 @@ class Judgement:
         self.counters: Counter[str] = Counter()
         self._settings = settings
         self._calibrations = calibrations or Calibrations(matching)
+        self._limit = settings.reject_chi_square
         self._waiting: deque[Closure] = deque(maxlen=settings.waiting)
         self._hints: deque[int] = deque(maxlen=settings.hints)
 
@@ -128,6 +130,30 @@ class Judgement:
         for number in self._hints:
             fits = graph.chi_square(number) < self._settings.accept_chi_square
             graph.set_active(number, active=fits)
+
+    def doubt(self, closures: list[Closure], graph: PoseGraph) -> Doubt | None:
+        """Return all closures as a doubt where some contradict the others, else None."""
+        numbers = [
+            c.number
+            for c in closures
+            if c.number is not None and c.stage is Stage.CONSISTENT and c.number in graph
+        ]
+        if all(graph.is_active(n) and graph.chi_square(n) <= self._limit for n in numbers):
+            return None
+        return graph.doubt(numbers, self._limit)
+
+    def settle(
+        self, doubt: Doubt, false: list[int], closures: list[Closure], graph: PoseGraph
+    ) -> None:
+        """Let the closures of a doubt be as active as its solution says."""
+        for closure in closures:
+            number = closure.number
+            if number is None or number not in doubt.doubted or number not in graph:
+                continue
+            was, closure.active = closure.active, number not in false
+            self.counters["closures_thrown_out"] += was and not closure.active
+            self.counters["closures_restored"] += closure.active and not was
+            graph.set_active(number, active=closure.active)
 
     def forget(self, before_s: float, graph: PoseGraph) -> None:
         """Wait no longer for closures found before a time; drop hints that the graph let go."""

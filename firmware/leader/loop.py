@@ -59,7 +59,7 @@ class LeaderLoop:
         while True:
             finished = self._worker.take()
             if finished is not None:
-                self.core.finish(finished.batch, finished.outcomes, now_s)
+                self.core.finish(finished.batch, finished.findings, now_s)
             batch = self.core.next_jobs() if self._worker.is_free else None
             if batch is None:
                 return

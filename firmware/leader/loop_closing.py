@@ -10,8 +10,8 @@ from firmware.leader.atlas import Atlas, Sheet
 from firmware.leader.closure_log import ClosureLog, Verdict, verdict_of
 from firmware.leader.closures import Closure, closure_of, gated
 from firmware.leader.judgement import Judgement
-from firmware.leader.match_jobs import SheetJobs, jobs_for
-from firmware.leader.matching import MatchOutcome
+from firmware.leader.match_jobs import Findings, SheetJobs, jobs_for
+from firmware.leader.nonconvexity import Doubt
 from firmware.leader.open_pairs import OpenPairs
 from firmware.leader.pairing import Calibrations
 from firmware.leader.pose_graph import PoseGraph
@@ -38,6 +38,7 @@ class LoopClosing:
         self._judgement = Judgement(settings.judgement, settings.matching, self._calibrations)
         self._open = OpenPairs(settings.closures)
         self._sheets_judged = 0
+        self._doubt: Doubt | None = None  # to go with the next matches
         self._closures: list[Closure] = []  # on which something may yet be decided
         self._settled = ClosureLog()
 
@@ -58,12 +59,16 @@ class LoopClosing:
             self._counters["submaps_unplaceable"] += 1
             jobs = []
         looks = self._open.second_looks(sheet, self._atlas, self._graph, self._calibrations)
-        return SheetJobs(sheet=sheet, jobs=(*jobs, *looks))
+        doubt, self._doubt = self._doubt, None
+        return SheetJobs(sheet=sheet, jobs=(*jobs, *looks), doubt=doubt)
 
-    def finish(self, done: SheetJobs, outcomes: list[MatchOutcome], now_s: float) -> None:
+    def finish(self, done: SheetJobs, findings: Findings, now_s: float) -> None:
         """Judge what the matches of one sheet found, and bring the estimate up to it."""
+        false = findings.false_closures
+        if done.doubt is not None and false is not None:
+            self._judgement.settle(done.doubt, false, self._closures, self._graph)
         found = []
-        for job, outcome in zip(done.jobs, outcomes, strict=True):
+        for job, outcome in zip(done.jobs, findings.outcomes, strict=True):
             if outcome.reason is not None:
                 self._counters[f"match_{outcome.reason.name.lower()}"] += 1
             try:
@@ -87,6 +92,7 @@ class LoopClosing:
         if self._sheets_judged % self._settings.sheets_between_audits == 0:
             self._judgement.audit(self._closures, self._graph)
             self._graph.update()
+            self._doubt = self._judgement.doubt(self._closures, self._graph)
 
     def forget(self, before_s: float) -> None:
         """Settle the closures of a past that was composed: nothing is decided on them any more."""

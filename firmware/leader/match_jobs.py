@@ -13,6 +13,7 @@ from firmware.leader.displacement import Look
 from firmware.leader.drifts import NO_DRIFT, Drifts
 from firmware.leader.estimate import Estimate
 from firmware.leader.matching import MatchingSettings, MatchOutcome, match
+from firmware.leader.nonconvexity import Doubt
 from firmware.leader.offsets import Offset, correction_of, corrections, offsets_of
 from firmware.leader.pairing import Calibrations, Side, side_of, strain_m
 from firmware.submaps import GriddedSubmap
@@ -56,15 +57,33 @@ class MatchJob:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Findings:
+    """What came of a batch: an outcome of each match, and which closures in doubt are false.
+
+    The latter is None where none were in doubt, or the doubt has no solution.
+    """
+
+    outcomes: list[MatchOutcome]
+    false_closures: list[int] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SheetJobs:
-    """The matches of one new sub-map, and second looks; run all, hand the outcomes to `finish`."""
+    """The matches of one new sub-map, and second looks; run all, hand the findings to `finish`.
+
+    Where closures contradict each other, they come as a doubt beside the matches.
+    """
 
     sheet: Sheet
     jobs: tuple[MatchJob, ...]
+    doubt: Doubt | None = None
 
-    def run(self) -> list[MatchOutcome]:
+    def run(self) -> Findings:
         """Run all matches, in order."""
-        return [job.run() for job in self.jobs]
+        return Findings(
+            outcomes=[job.run() for job in self.jobs],
+            false_closures=None if self.doubt is None else self.doubt.run(),
+        )
 
 
 def jobs_for(

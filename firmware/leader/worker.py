@@ -6,8 +6,7 @@ import threading
 from dataclasses import dataclass
 from typing import Protocol
 
-from firmware.leader.match_jobs import SheetJobs
-from firmware.leader.matching import MatchOutcome
+from firmware.leader.match_jobs import Findings, SheetJobs
 
 LOG = logging.getLogger(__name__)
 
@@ -17,7 +16,7 @@ class Finished:
     """A batch of matches and what came of them."""
 
     batch: SheetJobs
-    outcomes: list[MatchOutcome]
+    findings: Findings
 
 
 class Worker(Protocol):
@@ -50,7 +49,7 @@ class InlineWorker:
 
     def give(self, batch: SheetJobs) -> None:
         """Run a batch."""
-        self._finished = Finished(batch=batch, outcomes=batch.run())
+        self._finished = Finished(batch=batch, findings=batch.run())
 
     def take(self) -> Finished | None:
         """Return the finished batch, once."""
@@ -100,7 +99,7 @@ class ThreadWorker:
     def _work(self) -> None:
         while (batch := self._in.get()) is not None:
             try:
-                self._out.put(Finished(batch=batch, outcomes=batch.run()))
+                self._out.put(Finished(batch=batch, findings=batch.run()))
             except Exception:
                 LOG.exception("the matches of %s failed", batch.sheet.id)
                 self._out.put(None)

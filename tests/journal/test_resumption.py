@@ -7,7 +7,8 @@ import pytest
 from firmware.follower.journaled import JournaledFollower
 from firmware.inputs import fan_of, from_ping, to_odometry, to_ping
 from firmware.journal import Journal, JournalSettings, Owner
-from firmware.leader.journaled import JournaledLeader, from_outcomes, to_outcomes
+from firmware.leader.journaled import JournaledLeader, from_findings, to_findings
+from firmware.leader.match_jobs import Findings
 from firmware.leader.matches import Hint, Match, MatchOutcome, NoMatch
 from firmware.soundings import Ping
 from host_tools.kills import Fate, MortalJournal, MortalNode, SensorTape
@@ -185,7 +186,10 @@ def test_outcomes_read_back_exactly() -> None:
     outcomes += [MatchOutcome(match=None, reason=reason) for reason in NoMatch]
     hint = Hint(shift_m=np.array([0.1, -3.0]), covariance_m2=np.eye(2) / 3)
     outcomes.append(MatchOutcome(match=None, reason=NoMatch.AMBIGUOUS, hint=hint))
-    read, now_s = to_outcomes(from_outcomes(outcomes, 0.1 + 0.2))
+    findings = Findings(outcomes=outcomes, false_closures=[3, 141])
+    found_again, now_s = to_findings(from_findings(findings, 0.1 + 0.2))
+    read = found_again.outcomes
+    assert found_again.false_closures == [3, 141]
     assert now_s == 0.1 + 0.2
     assert [o.reason for o in read] == [o.reason for o in outcomes]
     assert read[0].match is not None

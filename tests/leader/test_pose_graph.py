@@ -41,7 +41,12 @@ def started(track: Track, vehicle: int = 0, graph: PoseGraph | None = None) -> P
 
 
 def close(
-    graph: PoseGraph, track: Track, true_m: np.ndarray, a_s: int, b_s: int, error_m: float = 0.0
+    graph: PoseGraph,
+    track: Track,
+    true_m: np.ndarray,
+    a_s: int,
+    b_s: int,
+    error_m: float | np.ndarray = 0.0,
 ) -> int:
     ends = [graph.anchor(0, float(t), track) for t in (a_s, b_s)]
     offset_m = true_m[b_s] - true_m[a_s] + error_m

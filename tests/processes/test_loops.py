@@ -153,10 +153,10 @@ class Batch:
     def __init__(self, outcome: object) -> None:
         self.outcome = outcome
 
-    def run(self) -> list[object]:
+    def run(self) -> object:
         if isinstance(self.outcome, Exception):
             raise self.outcome
-        return [self.outcome]
+        return self.outcome
 
 
 def test_the_worker_takes_one_batch_at_a_time_and_survives_a_bad_one(
@@ -171,7 +171,7 @@ def test_the_worker_takes_one_batch_at_a_time_and_survives_a_bad_one(
         while not worker.is_free:
             finished = worker.take()
             if finished is not None:
-                assert finished.outcomes == [outcome]
+                assert finished.findings == outcome
     assert worker.failed == 1
     assert "the matches of 7 failed" in caplog.text
     worker.close()

@@ -1,0 +1,102 @@
+"""All closures weighed at once by graduated non-convexity, beside the live estimate.
+
+A few false closures that agree with each other bend an estimate until it contradicts the true ones:
+then an audit, which goes by the estimate, takes back the wrong side. Here a solution of all of
+them is found that is convex at first, so that it begins nowhere in particular, and then forgives
+large innovations more and more: what it ends with has few contradictions, and those are thrown out.
+
+Source: Yang, Antonante, Tzoumas and Carlone, Graduated non-convexity for robust spatial perception,
+RA-L 2020: truncated least squares, Eq. 12 to 15. gtsam has it, too, but cannot clone our factors.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from firmware.geometry import Array
+from firmware.leader.factors import factor_of
+from firmware.leader.ledger import ClosureRecord, Record
+
+_STEEPER = 1.4  # from round to round, as in the source
+_ROUNDS = 60
+_SURE = 0.01  # weights this near to zero or one are taken for it
+_LEAST_WEIGHT = 1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Doubt:
+    """A ledger with closures in doubt, as plain values that a worker may solve.
+
+    believed are the records that are not in doubt, estimate the variables of both; a closure is
+    false beyond chi_square.
+    """
+
+    believed: tuple[Record, ...]
+    doubted: Mapping[int, ClosureRecord]
+    estimate: Mapping[int, Array]
+    robust_kernel: float
+    chi_square: float
+
+    def run(self) -> list[int] | None:
+        """Return the numbers of the false closures, None if there is no solution."""
+        try:
+            return self._false()
+        except RuntimeError:  # gtsam's, of a system that is indeterminate
+            return None
+
+    def _false(self) -> list[int]:
+        certain = [factor_of(record, self.robust_kernel) for record in self.believed]
+        weights = dict.fromkeys(self.doubted, 1.0)
+        values = gtsam.Values()
+        for key, state in self.estimate.items():
+            values.insert(key, state)
+        values = self._solved(certain, weights, values)
+        squares = self._squares(values)
+        convexity = self.chi_square / max(2.0 * max(squares.values()) - self.chi_square, 1e-9)
+        for _ in range(_ROUNDS if max(squares.values()) > self.chi_square else 0):
+            weights = {n: self._weight(square, convexity) for n, square in squares.items()}
+            values = self._solved(certain, weights, values)
+            squares = self._squares(values)
+            if all(weight < _SURE or weight > 1.0 - _SURE for weight in weights.values()):
+                break
+            convexity *= _STEEPER
+        return [number for number, weight in weights.items() if weight < 0.5]
+
+    def _weight(self, square: float, convexity: float) -> float:
+        """Return the weight of a squared innovation (Eq. 14 of the source)."""
+        limit = self.chi_square
+        if square <= convexity / (convexity + 1.0) * limit:
+            return 1.0
+        if square >= (convexity + 1.0) / convexity * limit:
+            return 0.0
+        return float(np.sqrt(limit * convexity * (convexity + 1.0) / square) - convexity)
+
+    def _solved(
+        self,
+        certain: list[gtsam.NonlinearFactor],
+        weights: Mapping[int, float],
+        values: gtsam.Values,
+    ) -> gtsam.Values:
+        graph = gtsam.NonlinearFactorGraph()
+        for factor in certain:
+            graph.push_back(factor)
+        for number, weight in weights.items():
+            if weight > _LEAST_WEIGHT:
+                record = self.doubted[number]
+                wider = replace(record, covariance_m2=record.covariance_m2 / weight)
+                graph.push_back(factor_of(wider, np.inf))
+        parameters = gtsam.GaussNewtonParams()
+        parameters.setLinearSolverType("MULTIFRONTAL_QR")
+        parameters.setMaxIterations(3)
+        return gtsam.GaussNewtonOptimizer(graph, values, parameters).optimize()
+
+    def _squares(self, values: gtsam.Values) -> dict[int, float]:
+        squares = {}
+        for number, record in self.doubted.items():
+            innovation_m = record.innovation_m(values.atVector)
+            squares[number] = float(
+                innovation_m @ np.linalg.solve(record.covariance_m2, innovation_m)
+            )
+        return squares

@@ -134,7 +134,8 @@ class LeaderCore:
             return
         self.counters["frames_received"] += 1
         if toa_s is not None:
-            self._ranging.hold(self.fleet.chain(header), header, toa_s)
+            depth_m = self._reckoning.state.depth_m
+            self._ranging.hold(self.fleet.chain(header), header, toa_s, depth_m)
         self._arrivals.receive(packet, now_s)
 
     # what is done

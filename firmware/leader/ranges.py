@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from firmware.geometry import Array
+from firmware.sound_speed import SoundProfile
 from protocol.settings import Settings, setting
 
 _WILD_DENSITY = 1e-4  # per metre: multipath from anywhere in the water column
@@ -31,8 +32,13 @@ class RangeSettings(Settings):
     """How ranges are formed and judged."""
 
     sound_speed_mps: float = setting(
-        1500.0, "m/s", "the mean over the path; a profile may be configured", minimum=1300.0,
+        1500.0, "m/s", "the mean over the path, where no profile is configured", minimum=1300.0,
         maximum=1700.0,
+    )  # fmt: skip
+    sound_profile: SoundProfile = setting(SoundProfile, "", "sound speed over depth")
+    follower_depth_m: float | None = setting(
+        None, "m", "of all followers, since frames do not tell it; none: the leader's own",
+        minimum=0.0,
     )  # fmt: skip
     sigma_m: float = setting(1.0, "m", "noise of one range (Eq. 13)", minimum=1e-3)
     outlier_factor: float = setting(

@@ -10,6 +10,7 @@ import numpy as np
 from firmware.leader.ledger import Anchor
 from firmware.leader.pose_graph import PoseGraph
 from firmware.leader.ranges import RangeJudge, RangeSettings, RangeVerdict
+from firmware.sound_speed import horizontal_m
 from firmware.submaps import Track
 from protocol.errors import EstimationError
 from protocol.packets import Header
@@ -18,29 +19,45 @@ from protocol.timestamps import transmission_s
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _HeldRange:
-    """A range whose sender's track arrives only later."""
+    """A slant range whose sender's track arrives only later; its ends are apart_m in depth."""
 
     chain: int
     sent_s: float
     arrived_s: float
     range_m: float
+    apart_m: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _PlacedRange:
-    """A range between two anchors of the graph, with what the graph predicts for it.
+    """A slant range between two anchors of the graph, and the horizontal one that it predicts.
 
     clock_m of it are the sender's clock's, as far as that is known.
     """
 
     sender: int
     range_m: float
+    apart_m: float
     clock_m: float
     clock_sigma_m: float
     here: Anchor
     there: Anchor
     predicted_m: float
     direction: np.ndarray  # (2,) unit vector from here to there
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _BelievedRange:
+    """A range for the graph: horizontal, but for what the sender's clock adds.
+
+    Steepness is depth over distance: by so much, in quadrature, noise and a depth that is wrong
+    count for more across than along the slant.
+    """
+
+    placed: _PlacedRange
+    range_m: float
+    steepness: float
+    stretched: bool
 
 
 @dataclass(slots=True)
@@ -76,22 +93,33 @@ class Ranging:
         self._held: deque[_HeldRange] = deque(maxlen=settings.held)
         self._waiting: dict[int, deque[_Window]] = {}
 
-    def hold(self, chain: int, header: Header, toa_s: float) -> None:
+    def hold(self, chain: int, header: Header, toa_s: float, depth_m: float) -> None:
         """Keep the range that a frame's arrival tells, until its sender's track is known.
 
-        Frames of one packet arrive as one: their range is one measurement, not several.
+        depth_m is our own. Frames of one packet arrive as one: their range is one measurement,
+        not several.
         """
+        s = self._settings
         if any(r.chain == chain and r.arrived_s == toa_s for r in self._held):
             self.counters["ranges_of_one_packet"] += 1
             return
         if len(self._held) == self._held.maxlen:
             self.counters["ranges_overwritten"] += 1
         sent_s = transmission_s(header.tx_second, toa_s)
-        range_m = (toa_s - sent_s) * self._settings.sound_speed_mps
-        if not self._settings.shortest_m <= range_m <= self._settings.longest_m:
+        sender_m = depth_m if s.follower_depth_m is None else s.follower_depth_m
+        speed_mps = s.sound_profile.speed_mps(sender_m, depth_m, s.sound_speed_mps)
+        range_m, apart_m = (toa_s - sent_s) * speed_mps, abs(sender_m - depth_m)
+        if not s.shortest_m <= range_m <= s.longest_m:
             self.counters["ranges_impossible"] += 1
             return
-        self._held.append(_HeldRange(chain=chain, sent_s=sent_s, arrived_s=toa_s, range_m=range_m))
+        if not horizontal_m(range_m, apart_m) > 0.0:
+            self.counters["ranges_too_steep"] += 1
+            return
+        self._held.append(
+            _HeldRange(
+                chain=chain, sent_s=sent_s, arrived_s=toa_s, range_m=range_m, apart_m=apart_m
+            )
+        )
 
     def use(
         self, chain: int, track: Track, receiver: int, receiver_track: Track, graph: PoseGraph
@@ -177,7 +205,7 @@ class Ranging:
             return _Fate.BENT
         verdict = self._judge.judge(
             np.array([p.range_m - p.clock_m for p in placed]),
-            np.array([p.predicted_m for p in placed]),
+            np.array([np.hypot(p.predicted_m, p.apart_m) for p in placed]),
             np.array([p.there.time_s for p in placed]),
             float(np.hypot(along_m, bent_m)),
         )
@@ -190,26 +218,47 @@ class Ranging:
             self.counters["ranges_used_roughly"] += len(placed) if roughly else 0
         spread_m = bent_m * float(s.bent_alike * np.sqrt(len(placed))) if roughly else bent_m
         window.bent_m = bent_m
+        believed = list(self._believed(placed, verdict))
         window.entered = [
-            graph.add_range(p.here, p.there, range_m, spread_m, sender=p.sender)
-            for p, range_m in self._believed(placed, verdict)
+            graph.add_range(
+                b.placed.here,
+                b.placed.there,
+                b.range_m,
+                float(np.hypot(spread_m, s.sigma_m * b.steepness)),
+                sender=b.placed.sender,
+            )
+            for b in believed
         ]
         if roughly:
             return _Fate.ROUGHLY
-        self.counters["ranges_used"] += int(verdict.true.sum())
-        self.counters["ranges_unstretched"] += int(verdict.stretched.sum())
+        unstretched = sum(b.stretched for b in believed)
+        self.counters["ranges_used"] += len(believed) - unstretched
+        self.counters["ranges_unstretched"] += unstretched
         self.counters["ranges_rejected"] += len(placed) - len(window.entered)
         return _Fate.ENTERED
 
     def _believed(
         self, placed: list[_PlacedRange], verdict: RangeVerdict
-    ) -> Iterator[tuple[_PlacedRange, float]]:
-        """Yield the ranges that are believed, and how long they are without their stretch."""
+    ) -> Iterator[_BelievedRange]:
+        """Yield the ranges that are believed, without their stretch and slant.
+
+        One that is found to be shorter than its ends are apart in depth is left out.
+        """
         for p, true, stretched in zip(placed, verdict.true, verdict.stretched, strict=True):
-            if true:
-                yield p, p.range_m
-            elif stretched:
-                yield p, p.clock_m + (p.range_m - p.clock_m) / self._settings.outlier_factor
+            if not true and not stretched:
+                continue
+            range_m = p.range_m
+            if stretched:
+                range_m = p.clock_m + (p.range_m - p.clock_m) / self._settings.outlier_factor
+            slant_m = range_m - p.clock_m
+            across_m = horizontal_m(slant_m, p.apart_m)
+            if across_m > 0.0:
+                yield _BelievedRange(
+                    placed=p,
+                    range_m=range_m - (slant_m - across_m),
+                    steepness=p.apart_m / across_m,
+                    stretched=bool(stretched),
+                )
 
 
 def _spread(placed: _PlacedRange, graph: PoseGraph) -> tuple[float, float]:
@@ -236,6 +285,7 @@ def _placed(
     return _PlacedRange(
         sender=sender,
         range_m=held.range_m,
+        apart_m=held.apart_m,
         clock_m=clock_m,
         clock_sigma_m=clock_sigma_m,
         here=here,

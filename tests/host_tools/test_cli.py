@@ -8,6 +8,8 @@ from host_tools.cli import main
 from protocol.codec import encode
 from protocol.packets import Answer, Header, Profile, SubmapPacket
 
+PROFILE = "leader.ranges.sound_profile.points"
+
 
 def frames() -> list[bytes]:
     answer = Answer(
@@ -69,6 +71,16 @@ def test_short_keys_of_the_contract_are_not_ambiguous(
 
 
 @pytest.mark.parametrize(
+    ("given", "shown"), [("0,1500,50.5,1480", "0,1500,50.5,1480"), ("", "none"), ("none", "none")]
+)
+def test_sound_profile_is_shown_as_it_is_set(
+    given: str, shown: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["config", "show", "--set", f"{PROFILE}={given}"]) == 0
+    assert f"{PROFILE} = {shown} m,m/s" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["--scenario", "paper-9"], "choose one of paper-1, paper-2, field-1, day-1"),
@@ -76,6 +88,8 @@ def test_short_keys_of_the_contract_are_not_ambiguous(
         (["--set", "leg_m"], "is not KEY=VALUE"),
         (["--set", "leg_m=long"], "give a value of type float"),
         (["--loss", "1.5"], "must be at most 1"),
+        (["--set", f"{PROFILE}=0,1500,50"], "give pairs of depth in m and speed in m/s"),
+        (["--set", f"{PROFILE}=0,1500,50,fast"], "give a value of type float"),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(

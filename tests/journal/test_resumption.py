@@ -27,6 +27,9 @@ SHORT = {
     "leg_m": 60.0,
     "beams": 32,
     "leader.composition.interval_s": 30.0,
+    "depth_wander_m": 4.0,
+    "leader.ranges.sound_profile.points": (0.0, 1480.0, 10.0, 1500.0, 30.0, 1450.0),
+    "leader.ranges.follower_depth_m": 12.0,
 }
 KILLS = 8
 
@@ -113,6 +116,13 @@ def test_kills_change_no_frame_no_belief_and_no_estimate(undisturbed: Told, kill
 
 def test_every_counter_is_what_it_would_have_been(undisturbed: Told, killed: Told) -> None:
     assert killed.counters == undisturbed.counters
+
+
+def test_ranges_keep_the_depth_that_they_arrived_at(undisturbed: Told, killed: Told) -> None:
+    leaders = [told.nodes[0].core for told in (undisturbed, killed)]
+    ranges = [core._ranging._held for core in leaders if isinstance(core, JournaledLeader)]
+    assert ranges[1] == ranges[0]
+    assert len({one.apart_m for one in ranges[0]}) > 5
 
 
 def test_nothing_is_sent_while_catching_up_nor_told_differently(killed: Told) -> None:

@@ -41,7 +41,7 @@ def ranged(settings: GraphSettings) -> PoseGraph:
         graph.extend(vehicle, tracks[vehicle])
     ranging, header = Ranging(RangeSettings()), replace(paper_packet().header, tx_second=0)
     for sent_s in range(16, int(END_S) - 16, 16):
-        ranging.hold(1, header, _arrival_s(sent_s, tracks))
+        ranging.hold(1, header, _arrival_s(sent_s, tracks), 10.0)
         ranging.use(1, tracks[1], 0, tracks[0], graph)
     graph.update()
     return graph

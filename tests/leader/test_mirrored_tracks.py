@@ -75,7 +75,7 @@ class Pair:
             profile=Profile.TRAJECTORY, vehicle=1, boot_epoch=0, submap=0, fragment=0,
             fragment_count=1, tx_second=now_s % 16, time_quarters=0,
         )  # fmt: skip
-        self.ranging.hold(1, header, now_s + range_m / 1500.0)
+        self.ranging.hold(1, header, now_s + range_m / 1500.0, 10.0)
 
     def _use(self, now_s: int) -> None:
         for vehicle in (0, 1):

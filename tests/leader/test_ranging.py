@@ -9,14 +9,16 @@ from firmware.leader.ranging import Ranging, _Fate
 from firmware.submaps import Track
 from tests.protocol.strategies import paper_packet
 
+DEPTH_M = 10.0
+
 
 def test_frames_of_one_packet_give_one_range() -> None:
     ranging = Ranging(RangeSettings())
     header = replace(paper_packet().header, tx_second=8)
     for fragment in (0, 1):
-        ranging.hold(1, replace(header, fragment=fragment), 8.4)
-    ranging.hold(2, header, 8.4)  # another vehicle, though it can hardly be
-    ranging.hold(1, header, 24.4)
+        ranging.hold(1, replace(header, fragment=fragment), 8.4, DEPTH_M)
+    ranging.hold(2, header, 8.4, DEPTH_M)  # another vehicle, though it can hardly be
+    ranging.hold(1, header, 24.4, DEPTH_M)
     assert [held.chain for held in ranging._held] == [1, 2, 1]
     assert ranging.counters == {"ranges_of_one_packet": 1}
 
@@ -29,7 +31,7 @@ def _track(end_s: float) -> Track:
 def _heard(ranging: Ranging, begin_s: int, end_s: int) -> None:
     header = paper_packet().header
     for sent_s in range(begin_s, end_s, 8):
-        ranging.hold(1, replace(header, tx_second=sent_s % 16), sent_s + 0.4)
+        ranging.hold(1, replace(header, tx_second=sent_s % 16), sent_s + 0.4, DEPTH_M)
 
 
 def test_window_that_stays_undecided_does_not_hold_up_older_ones(
@@ -83,6 +85,6 @@ def test_no_window_grows_without_bound(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("late_s", [0.0, 0.001, 60.0])
 def test_impossible_ranges_are_counted_and_not_held(late_s: float) -> None:
     ranging = Ranging(RangeSettings())
-    ranging.hold(1, replace(paper_packet().header, tx_second=8), 8.0 + late_s)
+    ranging.hold(1, replace(paper_packet().header, tx_second=8), 8.0 + late_s, DEPTH_M)
     assert not ranging._held
     assert ranging.counters["ranges_impossible"] == 1

@@ -237,7 +237,9 @@ class FollowerCore:
     def _receive_range(self, answer: ExtendedAnswer, toa_s: float, now_s: float) -> None:
         """Range-aid: the answer says where the leader was, its way how far that is from here."""
         sent_s = transmission_s(answer.header.tx_second, toa_s)
-        range_m = (toa_s - sent_s) * self._settings.correction.sound_speed_mps
+        s, depth_m = self._settings.correction, self._reckoning.state.depth_m
+        leader_m = depth_m if s.leader_depth_m is None else s.leader_depth_m
+        speed_mps = s.sound_profile.speed_mps(leader_m, depth_m, s.sound_speed_mps)
         if not abs(now_s - toa_s) <= _LONGEST_AIRTIME_S:
             self.counters["ranges_unplaceable"] += 1
             return
@@ -246,7 +248,8 @@ class FollowerCore:
             self._known_track().position_at(toa_s),
             np.array([answer.leader_north_m, answer.leader_east_m]),
             float(np.sqrt(answer.leader_variance_m2)) if answer.leader_variance_m2 > 0 else np.nan,
-            range_m,
+            (toa_s - sent_s) * speed_mps,
+            abs(leader_m - depth_m),
         )
 
     def _receive_answer(self, answer: Answer | ExtendedAnswer, now_s: float) -> None:

@@ -20,6 +20,7 @@ from firmware.follower.drift_filter import (
     RangeSeen,
 )
 from firmware.geometry import Array
+from firmware.sound_speed import SoundProfile, horizontal_m
 from protocol.settings import setting
 
 _CHI_SQUARE_1_99, _CHI_SQUARE_2_999 = 6.6, 13.8  # shares of true innovations that lie below
@@ -40,7 +41,12 @@ class CorrectionSettings(DriftSettings):
         maximum=1.0,
     )  # fmt: skip
     sound_speed_mps: float = setting(
-        1500.0, "m/s", "mean over the path", minimum=1300.0, maximum=1700.0
+        1500.0, "m/s", "the mean over the path, where no profile is configured", minimum=1300.0,
+        maximum=1700.0,
+    )  # fmt: skip
+    sound_profile: SoundProfile = setting(SoundProfile, "", "sound speed over depth")
+    leader_depth_m: float | None = setting(
+        None, "m", "since answers do not tell it; none: our own", minimum=0.0
     )
     shortest_range_m: float = setting(20.0, "m", "nearer, the direction says nothing", minimum=0.0)
     longest_range_m: float = setting(10_000.0, "m", "no modem here carries farther", minimum=10.0)
@@ -111,10 +117,12 @@ class DriftCorrection:
         reckoned_m: Array,
         leader_m: Array,
         leader_sigma_m: float,
-        range_m: float,
+        slant_m: float,
+        apart_m: float,
     ) -> bool:
-        """Learn from the distance to the leader; return whether it was believed."""
+        """Learn from the range to the leader, apart_m in depth; return whether it was believed."""
         s = self._settings
+        range_m = horizontal_m(slant_m, apart_m)
         numbers = [time_s, *reckoned_m, *leader_m, leader_sigma_m, range_m]
         sane = bool(np.isfinite(numbers).all()) and time_s >= self._base.time_s
         if not sane or not s.shortest_range_m <= range_m <= s.longest_range_m:
@@ -126,6 +134,7 @@ class DriftCorrection:
             leader_m=np.asarray(leader_m),
             leader_sigma_m=leader_sigma_m,
             range_m=range_m,
+            apart_m=apart_m,
         )
         if self._filter.chi_square(self._state_at(time_s), seen) > _CHI_SQUARE_1_99:
             self.ranges_gated += 1

@@ -42,13 +42,17 @@ class AnswerSeen:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RangeSeen:
-    """A range to the leader, where the leader was (2,) and where dead reckoning was (2,)."""
+    """A horizontal range to the leader, where the leader was (2,) and dead reckoning was (2,).
+
+    It was measured along a slant between depths that are apart_m apart.
+    """
 
     time_s: float
     reckoned_m: Array
     leader_m: Array
     leader_sigma_m: float
     range_m: float
+    apart_m: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,5 +136,8 @@ class DriftFilter:
         design[0, :2], design[0, 6:8] = -direction, lasting * one.leader_sigma_m * direction
         # beyond the first order: across the range, the position's uncertainty bends it
         across_m2 = float(np.trace(state.covariance[:2, :2])) / predicted_m
-        variance_m2 = s.range_sigma_m**2 + (fresh * one.leader_sigma_m) ** 2 + across_m2**2 / 4
+        range_m2 = s.range_sigma_m**2 * (
+            1.0 + (one.apart_m / predicted_m) ** 2
+        )  # across, not along
+        variance_m2 = range_m2 + (fresh * one.leader_sigma_m) ** 2 + across_m2**2 / 4
         return np.array([one.range_m - predicted_m]), design, np.array([[variance_m2]])

@@ -94,7 +94,7 @@ def test_ranges_to_the_leader_correct_along_their_direction() -> None:
     for time_s in np.arange(100.0, 200.0, 10.0):
         leader_m = np.array([400.0, 3.0 * (time_s - 150.0)])
         range_m = float(np.hypot(*leader_m))
-        assert correction.receive_range(float(time_s), drift_m(time_s), leader_m, 1.0, range_m)
+        assert correction.receive_range(float(time_s), drift_m(time_s), leader_m, 1.0, range_m, 0.0)
     position_m, covariance_m2 = correction.corrected(200.0, drift_m(200.0))
     assert position_m[0] == pytest.approx(0.0, abs=2.5)
     assert covariance_m2[0, 0] < covariance_m2[1, 1]
@@ -104,14 +104,36 @@ def test_stretched_range_is_gated() -> None:
     correction = taught()
     leader_m = np.array([800.0, 0.0])
     at_m = drift_m(610.0)
-    assert not correction.receive_range(610.0, at_m, leader_m, 1.0, 880.0)
+    assert not correction.receive_range(610.0, at_m, leader_m, 1.0, 880.0, 0.0)
     assert correction.ranges_gated == 1
 
 
 @pytest.mark.parametrize("bad_m", [0.0, -5.0, np.nan, np.inf, 100_000.0])
 def test_range_that_cannot_be_is_dropped(bad_m: float) -> None:
     correction = taught()
-    assert not correction.receive_range(610.0, np.zeros(2), np.array([9.0, 500.0]), 1.0, bad_m)
+    leader_m = np.array([9.0, 500.0])
+    assert not correction.receive_range(610.0, np.zeros(2), leader_m, 1.0, bad_m, 0.0)
+
+
+def test_range_counts_as_far_as_it_goes_across_and_less_the_steeper() -> None:
+    at_m, leader_m = drift_m(610.0), np.array([400.0, 0.0])
+    sigmas_m = []
+    for apart_m in (0.0, 300.0, 800.0):
+        correction = taught()
+        slant_m = float(np.hypot(400.0, apart_m))
+        assert correction.receive_range(610.0, at_m, leader_m, 1.0, slant_m, apart_m)
+        position_m, covariance_m2 = correction.corrected(610.0, at_m)
+        assert position_m[0] == pytest.approx(0.0, abs=2.5)
+        sigmas_m.append(float(np.sqrt(covariance_m2[0, 0])))
+    assert sigmas_m == sorted(sigmas_m)
+    assert sigmas_m[2] > 1.1 * sigmas_m[0]
+
+
+def test_range_shorter_than_depths_are_apart_is_dropped() -> None:
+    correction = taught()
+    leader_m = np.array([30.0, 0.0])
+    assert not correction.receive_range(610.0, drift_m(610.0), leader_m, 1.0, 30.0, 31.0)
+    assert correction.ranges_gated == 1
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from firmware.follower.core import FollowerCore
+from firmware.follower.correction import CorrectionSettings, DriftCorrection
+from firmware.sound_speed import SoundProfile
 from firmware.soundings import Odometry
 from protocol.codec import decode, encode
 from protocol.errors import EstimationError
@@ -213,6 +215,29 @@ def test_extended_answer_to_another_follower_ranges_too() -> None:
     assert core.status()["ranges_used"] == 1
     assert core.status()["answers_to_others"] == 1
     assert core.status()["answers_used"] == 0
+
+
+def test_range_to_a_leader_far_below_teaches_what_a_level_one_does() -> None:
+    """Between our 10 m and the leader's 130 m sound makes 1450 m/s on one half, then 1550."""
+    frame = extended_of(answer_of(90.0, 0.0, 0.0, fragment=2, tx_second=99 % 16))
+    across_m = float(np.hypot(600.0, 150.0 - 198.0)) + 2.0
+    slant_s = float(np.hypot(across_m, 120.0)) * 0.5 * (1.0 / 1450.0 + 1.0 / 1550.0)
+    step = (0.0, 1450.0, 70.0, 1450.0, 70.000001, 1550.0)
+    by_depth = CorrectionSettings(sound_profile=SoundProfile(points=step), leader_depth_m=130.0)
+    believed_m = []
+    for settings, travel_s in (
+        (CorrectionSettings(), across_m / 1500.0),
+        (by_depth, slant_s),
+        (CorrectionSettings(), slant_s),
+    ):
+        core = surveyed()
+        core._settings = dataclasses.replace(core._settings, correction=settings)
+        core._correction = DriftCorrection(0.0, settings)
+        core.receive_frame(frame, 99.0 + travel_s, 100.0)
+        assert core.status()["ranges_used"] == 1
+        believed_m.append(core.belief().position_m)
+    assert believed_m[1] == pytest.approx(believed_m[0], abs=0.1)
+    assert np.hypot(*(believed_m[2] - believed_m[0])) > 5.0
 
 
 @pytest.mark.parametrize("toa_s", [99.0, 99.0 + 100_000.0 / 1500.0, -50.0, 1e9])

@@ -46,7 +46,10 @@ class Anchor:
 
         It is moved by as much as the compass moves the place that was seen along the lever.
         """
-        return np.asarray(self.by_state @ state + self.offset_m - self.turning @ parameters)
+        heading_rad, scale = parameters
+        turned_m = QUARTER_TURN @ (self.offset_m + self.lever_m)
+        way_m = (1.0 - scale) * self.offset_m - heading_rad * turned_m - self.lag_s * state[2:]
+        return np.asarray(state[:2] + way_m)
 
 
 def as_reckoned(moved_m: Array, parameters: Array) -> Array:

@@ -217,9 +217,8 @@ class Composition:
         ]
 
     def _is_true(self, record: ClosureRecord) -> bool:
-        innovation_m = record.innovation_m(self._estimate.__getitem__)
-        chi_square = innovation_m @ np.linalg.solve(record.covariance_m2, innovation_m)
-        return bool(chi_square <= self._settings.reject_chi_square)
+        chi_square = record.chi_square(self._estimate.__getitem__)
+        return chi_square <= self._settings.reject_chi_square
 
     def _one_closure(self, records: list[ClosureRecord]) -> ClosureRecord:
         """Return their weighted mean, as uncertain as one of them: neighbours err alike."""

@@ -144,27 +144,29 @@ class Estimate:
         """Return estimated minus measured offset (2,) of a closure, in metres."""
         return self.closure(number).innovation_m(self._state)
 
-    def doubt(self, numbers: list[int], chi_square: float) -> Doubt:
-        """Return closures as false beyond a chi square, or not, by all else that is believed."""
-        doubted = {number: self.closure(number) for number in numbers}
+    def doubt(self, closures: Mapping[int, bool], limits: tuple[float, float]) -> Doubt:
+        """Return closures, and whether each is active, as doubted by all else that is believed.
+
+        limits are the chi squares within which one that is not active comes back, and beyond
+        which an active one is false.
+        """
         return Doubt(
             believed=tuple(
                 entry.record
                 for number, entry in self._ledger.items()
-                if entry.active and number not in doubted
+                if entry.active and number not in closures
             ),
-            doubted=doubted,
+            doubted={number: self.closure(number) for number in closures},
+            taken_back=frozenset(number for number, active in closures.items() if not active),
             estimate=self._states(),
             robust_kernel=self._settings.robust_kernel,
-            chi_square=chi_square,
+            accept_chi_square=limits[0],
+            reject_chi_square=limits[1],
         )
 
     def chi_square(self, number: int) -> float:
         """Return the squared innovation of a closure in units of its covariance."""
-        innovation_m = self.innovation(number)
-        return float(
-            innovation_m @ np.linalg.solve(self.closure(number).covariance_m2, innovation_m)
-        )
+        return self.closure(number).chi_square(self._state)
 
     def covariance(self, anchors: list[Anchor]) -> Array:
         """Return the joint covariance (2A, 2A) in m^2 of the positions of A anchors.

@@ -6,7 +6,8 @@ holds along one axis only, when the map that it would build agrees where the mat
 This is our reading of the paper's MCM, identification of invalid closures by the consistency of the
 built map; its text is not public.
 What is not yet believed waits, and is asked again when more is known. An audit takes back closures
-that the estimate has come to contradict, and takes them in again when it no longer does.
+that the estimate has come to contradict, and takes them in again when it no longer does. What it
+takes back leaves a doubt: whether it was not the others that were false.
 """
 
 from collections import Counter, deque
@@ -71,7 +72,7 @@ class Judgement:
         self.counters: Counter[str] = Counter()
         self._settings = settings
         self._calibrations = calibrations or Calibrations(matching)
-        self._limit = settings.reject_chi_square
+        self._settled: frozenset[int] = frozenset()  # closures that the last doubt found false
         self._waiting: deque[Closure] = deque(maxlen=settings.waiting)
         self._hints: deque[int] = deque(maxlen=settings.hints)
 
@@ -132,20 +133,22 @@ class Judgement:
             graph.set_active(number, active=fits)
 
     def doubt(self, closures: list[Closure], graph: PoseGraph) -> Doubt | None:
-        """Return all closures as a doubt where some contradict the others, else None."""
-        numbers = [
-            c.number
+        """Return all closures as a doubt once an audit has taken back some more, else None."""
+        active = {
+            c.number: c.active
             for c in closures
             if c.number is not None and c.stage is Stage.CONSISTENT and c.number in graph
-        ]
-        if all(graph.is_active(n) and graph.chi_square(n) <= self._limit for n in numbers):
+        }
+        if self._settled.issuperset(n for n, is_active in active.items() if not is_active):
             return None
-        return graph.doubt(numbers, self._limit)
+        s = self._settings
+        return graph.doubt(active, (s.accept_chi_square, s.reject_chi_square))
 
     def settle(
         self, doubt: Doubt, false: list[int], closures: list[Closure], graph: PoseGraph
     ) -> None:
         """Let the closures of a doubt be as active as its solution says."""
+        self._settled = frozenset(false)
         for closure in closures:
             number = closure.number
             if number is None or number not in doubt.doubted or number not in graph:

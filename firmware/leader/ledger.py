@@ -44,7 +44,8 @@ class Anchor:
     def position_m(self, state: Array, parameters: Array) -> Array:
         """Return the position (2,) by the node's state (4,) and the vehicle's parameters (2,).
 
-        It is moved by as much as the compass moves the place that was seen along the lever.
+        It is moved by as much as the compass moves the place that was seen along the lever: by
+        `by_state` and `turning`, which are not built for it, since solvers ask so often.
         """
         heading_rad, scale = parameters
         turned_m = QUARTER_TURN @ (self.offset_m + self.lever_m)
@@ -128,6 +129,11 @@ class ClosureRecord:
     def innovation_m(self, states: States) -> Array:
         """Return estimated minus measured offset (2,)."""
         return position_of(self.target, states) - position_of(self.origin, states) - self.offset_m
+
+    def chi_square(self, states: States) -> float:
+        """Return the squared innovation in units of its covariance."""
+        innovation_m = self.innovation_m(states)
+        return float(innovation_m @ np.linalg.solve(self.covariance_m2, innovation_m))
 
 
 def clock_row(time_s: float) -> Array:

@@ -97,6 +97,7 @@ class LoopClosing:
     def forget(self, before_s: float) -> None:
         """Settle the closures of a past that was composed: nothing is decided on them any more."""
         self._judgement.forget(before_s, self._graph)
+        self._doubt = None
         known, self._closures = self._closures, []
         for closure in known:
             newest_s = max(closure.origin_anchor.time_s, closure.target_anchor.time_s)

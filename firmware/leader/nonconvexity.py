@@ -1,8 +1,8 @@
 """All closures weighed at once by graduated non-convexity, beside the live estimate.
 
 A few false closures that agree with each other bend an estimate until it contradicts the true ones:
-then an audit, which goes by the estimate, takes back the wrong side. Here a solution of all of
-them is found that is convex at first, so that it begins nowhere in particular, and then forgives
+then an audit, which goes by the estimate, takes back the wrong side. Here all of them are asked
+again, those that were taken back among them, by a solution that is convex at first and forgives
 large innovations more and more: what it ends with has few contradictions, and those are thrown out.
 
 Source: Yang, Antonante, Tzoumas and Carlone, Graduated non-convexity for robust spatial perception,
@@ -21,6 +21,7 @@ from firmware.leader.ledger import ClosureRecord, Record
 
 _STEEPER = 1.4  # from round to round, as in the source
 _ROUNDS = 60
+_FIRST_STEPS, _STEPS = 5, 1  # of Gauss and Newton
 _SURE = 0.01  # weights this near to zero or one are taken for it
 _LEAST_WEIGHT = 1e-6
 
@@ -29,21 +30,23 @@ _LEAST_WEIGHT = 1e-6
 class Doubt:
     """A ledger with closures in doubt, as plain values that a worker may solve.
 
-    believed are the records that are not in doubt, estimate the variables of both; a closure is
-    false beyond chi_square.
+    believed are the records that are not in doubt, estimate the variables of both. A closure is
+    false beyond reject_chi_square; of those that were taken back, beyond accept_chi_square.
     """
 
     believed: tuple[Record, ...]
     doubted: Mapping[int, ClosureRecord]
+    taken_back: frozenset[int]
     estimate: Mapping[int, Array]
     robust_kernel: float
-    chi_square: float
+    accept_chi_square: float
+    reject_chi_square: float
 
     def run(self) -> list[int] | None:
         """Return the numbers of the false closures, None if there is no solution."""
         try:
             return self._false()
-        except RuntimeError:  # gtsam's, of a system that is indeterminate
+        except (RuntimeError, ValueError, IndexError):  # gtsam's, of an indeterminate system
             return None
 
     def _false(self) -> list[int]:
@@ -52,21 +55,28 @@ class Doubt:
         values = gtsam.Values()
         for key, state in self.estimate.items():
             values.insert(key, state)
-        values = self._solved(certain, weights, values)
+        values = self._solved(certain, weights, values, self.robust_kernel, _FIRST_STEPS)
         squares = self._squares(values)
-        convexity = self.chi_square / max(2.0 * max(squares.values()) - self.chi_square, 1e-9)
-        for _ in range(_ROUNDS if max(squares.values()) > self.chi_square else 0):
-            weights = {n: self._weight(square, convexity) for n, square in squares.items()}
-            values = self._solved(certain, weights, values)
-            squares = self._squares(values)
-            if all(weight < _SURE or weight > 1.0 - _SURE for weight in weights.values()):
-                break
-            convexity *= _STEEPER
-        return [number for number, weight in weights.items() if weight < 0.5]
+        if max(squares.values()) > self.reject_chi_square:
+            limit = self.reject_chi_square
+            convexity = limit / (2.0 * max(squares.values()) - limit)
+            for _ in range(_ROUNDS):
+                weights = {n: self._weight(square, convexity) for n, square in squares.items()}
+                values = self._solved(certain, weights, values, np.inf, _STEPS)
+                squares = self._squares(values)
+                if all(weight < _SURE or weight > 1.0 - _SURE for weight in weights.values()):
+                    break
+                convexity *= _STEEPER
+        return [
+            number
+            for number, weight in weights.items()
+            if weight < 0.5
+            or (number in self.taken_back and squares[number] > self.accept_chi_square)
+        ]
 
     def _weight(self, square: float, convexity: float) -> float:
         """Return the weight of a squared innovation (Eq. 14 of the source)."""
-        limit = self.chi_square
+        limit = self.reject_chi_square
         if square <= convexity / (convexity + 1.0) * limit:
             return 1.0
         if square >= (convexity + 1.0) / convexity * limit:
@@ -78,6 +88,8 @@ class Doubt:
         certain: list[gtsam.NonlinearFactor],
         weights: Mapping[int, float],
         values: gtsam.Values,
+        robust_kernel: float,
+        steps: int,
     ) -> gtsam.Values:
         graph = gtsam.NonlinearFactorGraph()
         for factor in certain:
@@ -86,17 +98,11 @@ class Doubt:
             if weight > _LEAST_WEIGHT:
                 record = self.doubted[number]
                 wider = replace(record, covariance_m2=record.covariance_m2 / weight)
-                graph.push_back(factor_of(wider, np.inf))
+                graph.push_back(factor_of(wider, robust_kernel))
         parameters = gtsam.GaussNewtonParams()
         parameters.setLinearSolverType("MULTIFRONTAL_QR")
-        parameters.setMaxIterations(3)
+        parameters.setMaxIterations(steps)
         return gtsam.GaussNewtonOptimizer(graph, values, parameters).optimize()
 
     def _squares(self, values: gtsam.Values) -> dict[int, float]:
-        squares = {}
-        for number, record in self.doubted.items():
-            innovation_m = record.innovation_m(values.atVector)
-            squares[number] = float(
-                innovation_m @ np.linalg.solve(record.covariance_m2, innovation_m)
-            )
-        return squares
+        return {n: record.chi_square(values.atVector) for n, record in self.doubted.items()}

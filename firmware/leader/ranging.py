@@ -213,12 +213,12 @@ class Ranging:
             return _Fate.UNDECIDED
         for number in window.entered:
             graph.set_active(number, active=False)
+        believed = list(self._believed(placed, verdict))
         if not window.is_judged:
             self._judge.learn(verdict)
-            self.counters["ranges_used_roughly"] += len(placed) if roughly else 0
+            self.counters["ranges_used_roughly"] += len(believed) if roughly else 0
         spread_m = bent_m * float(s.bent_alike * np.sqrt(len(placed))) if roughly else bent_m
         window.bent_m = bent_m
-        believed = list(self._believed(placed, verdict))
         window.entered = [
             graph.add_range(
                 b.placed.here,

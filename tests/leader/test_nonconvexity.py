@@ -15,6 +15,7 @@ from firmware.submaps import Track
 from tests.leader.test_pose_graph import close, started, walk
 
 SECONDS = 1200
+LIMITS = (6.0, 16.0)
 SHEET = SheetId(vehicle=0, boot_epoch=0, submap=0)
 
 
@@ -25,6 +26,7 @@ class Mission:
     seed: int
     true: int
     false: int
+    wrong_m: float = 40.0
 
     def __post_init__(self) -> None:
         rng = np.random.default_rng(self.seed)
@@ -33,7 +35,7 @@ class Mission:
         self.judgement = Judgement(JudgementSettings(), MatchingSettings())
         self.closures: list[Closure] = []
         wrong_m = rng.normal(0.0, 1.0, 2)
-        wrong_m *= 40.0 / np.hypot(*wrong_m)
+        wrong_m *= self.wrong_m / np.hypot(*wrong_m)
         for k in range(self.true + self.false):
             first_s = int(rng.integers(0, SECONDS - 300))
             last_s = int(rng.integers(first_s + 300, SECONDS))
@@ -105,6 +107,20 @@ def test_doubt_throws_out_the_false_closures_and_no_true_one(seed: int) -> None:
     assert mission.judgement.counters["closures_thrown_out"] <= 9
 
 
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(("false", "wrong_m"), [(1, 40.0), (3, 15.0), (6, 12.0)])
+def test_audits_and_doubts_come_to_rest(seed: int, false: int, wrong_m: float) -> None:
+    mission = Mission(seed, 20, false, wrong_m)
+    for _ in range(4):
+        _audited(mission)
+        doubt = mission.judgement.doubt(mission.closures, mission.graph)
+        if doubt is None:
+            break
+        _settled(mission)
+    assert doubt is None
+    assert mission.thrown_out()[:20].count(True) <= 1
+
+
 def test_audit_alone_takes_back_true_closures() -> None:
     audited = [_audited(Mission(seed, true=20, false=9)).thrown_out() for seed in range(4)]
     assert sum(out[:20].count(True) for out in audited) > 8
@@ -148,7 +164,7 @@ def test_hopeless_doubt_ends() -> None:
         for _ in range(12)
     ]
     graph.update()
-    false = graph.doubt(numbers, 16.0).run()
+    false = graph.doubt(dict.fromkeys(numbers, True), LIMITS).run()
     assert false is not None
     assert len(false) >= 10
 
@@ -156,5 +172,6 @@ def test_hopeless_doubt_ends() -> None:
 def test_doubt_without_a_solution_says_so() -> None:
     mission = Mission(9, true=3, false=0)
     numbers = [closure.number or 0 for closure in mission.closures]
-    doubt = dataclasses.replace(mission.graph.doubt(numbers, 16.0), believed=())
+    doubt = mission.graph.doubt(dict.fromkeys(numbers, True), LIMITS)
+    doubt = dataclasses.replace(doubt, believed=())
     assert doubt.run() is None

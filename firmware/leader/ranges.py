@@ -74,7 +74,7 @@ class RangeSettings(Settings):
         0.5, "m", "bend of a range that hides in its noise (1 m, Eq. 13)", minimum=0.01
     )
     bent_share: float = setting(
-        0.05, "1", "of a range: up to such a bend, a quarter of it aside, it is used roughly",
+        0.02, "1", "of a range: up to such a bend, a sixth of it aside, it is used roughly",
         minimum=0.0, maximum=1.0,
     )  # fmt: skip
     bent_alike: float = setting(

@@ -12,8 +12,9 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
-from multiprocessing.connection import Connection, Listener
+from multiprocessing import Pipe
 from pathlib import Path
 
 import matplotlib as mpl
@@ -24,6 +25,7 @@ from host_tools.commands import add_mission_arguments, settings_of
 from host_tools.mission import deployed, run, simulated_vehicles, water_between
 from host_tools.mission_settings import MissionSettings, changed
 from host_tools.nodes import BeliefLog
+from host_tools.processes.records import name_of
 from host_tools.simulator.placement import place_survey
 from host_tools.simulator.terrain import open_terrain
 from host_tools.simulator.vehicle import SimulatedVehicle
@@ -33,13 +35,19 @@ from matplotlib import pyplot as plt
 
 
 class Remote:
-    """A vehicle's process as the mission's clock sees it."""
+    """A vehicle's process as the mission's clock sees it; SystemExit where it ends too soon."""
 
-    def __init__(self, process_link: Connection, vehicle: SimulatedVehicle) -> None:
+    def __init__(self, vehicle: SimulatedVehicle, aboard: Aboard) -> None:
         self.log: BeliefLog = NoLog()
         self.costs_s: list[float] = []
-        self._link, self._steps = process_link, vehicle.steps()
+        self._name, self._steps = name_of(vehicle.index), vehicle.steps()
         self._heard: list[Heard] = []
+        self._link, end = Pipe()
+        command = [sys.executable, "-m", "benchmarks.days_vehicle", str(end.fileno())]
+        with end:  # once it is closed here, a process that ends closes the link
+            self._process = subprocess.Popen(command, pass_fds=[end.fileno()])
+        with suppress(OSError):  # the first order finds that the process has ended
+            self._link.send(aboard)
 
     def hear(self, frame: bytes, toa_s: float | None, now_s: float) -> None:
         """Keep a frame for the order of the next instant."""
@@ -49,20 +57,34 @@ class Remote:
         """Order one step, and note what it cost."""
         order = Order(now_s=now_s, step=next(self._steps, None), heard=tuple(self._heard))
         self._heard.clear()
-        self._link.send(order)
-        frame, cost_s = self._link.recv()
+        with self._alive(now_s):
+            self._link.send(order)
+            frame, cost_s = self._link.recv()
         self.costs_s.append(cost_s)
         return None if frame is None else bytes(frame)
 
     def gauge(self, now_s: float, *, compare: bool = False) -> Gauge:
         """Ask how the vehicle stands."""
-        self._link.send(Order(now_s=now_s, gauge=True, compare=compare))
-        gauge: Gauge = self._link.recv()
+        with self._alive(now_s):
+            self._link.send(Order(now_s=now_s, gauge=True, compare=compare))
+            gauge: Gauge = self._link.recv()
         return gauge
 
     def close(self) -> None:
-        """Let the process end."""
-        self._link.send(None)
+        """Let the process end, and wait for it."""
+        with suppress(OSError):  # it has ended already
+            self._link.send(None)
+        self._process.wait()
+
+    @contextmanager
+    def _alive(self, now_s: float) -> Iterator[None]:
+        try:
+            yield
+        except (EOFError, OSError):
+            raise SystemExit(
+                f"{self._name}: its process ended at {now_s:g} s of the mission with"
+                f" status {self._process.wait()}; its own words, if any, stand above"
+            ) from None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,34 +116,34 @@ def _line(row: Row) -> str:
     )
 
 
-def mission(settings: MissionSettings, terrain: Path | None, seed: int) -> Iterator[Row | Gauge]:
-    """Yield a row an hour, and at the end how far a batch solution lies from the estimate."""
+def mission(
+    settings: MissionSettings, terrain: Path | None, seed: int
+) -> tuple[list[Row], np.ndarray]:
+    """Run a mission and print a line an hour; return them as rows.
+
+    The second value is how far, in m (T,), a batch solution lies from the estimate at the end.
+    """
     scenario = settings.scenario
     site = place_survey(open_terrain(terrain, scenario.relief_seed), scenario, seed)
     vehicles = simulated_vehicles(settings, site, seed)
-    rate_hz, duration_s = scenario.ping_hz, scenario.duration_s
-    with tempfile.TemporaryDirectory() as folder, Listener(f"{folder}/mission") as listener:
-        remotes, processes = {}, []
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as processes:
+        remotes = {}
         for vehicle in vehicles:
-            command = [sys.executable, "-m", "benchmarks.days_vehicle", str(listener.address)]
-            processes.append(subprocess.Popen(command))
-            link = listener.accept()
-            link.send(
-                Aboard(
-                    vehicle=vehicle.index,
-                    settings=settings.follower if vehicle.index else settings.leader,
-                    slots=settings.slots,
-                    start=deployed(vehicle),
-                    folder=Path(folder),
-                )
+            aboard = Aboard(
+                vehicle=vehicle.index,
+                settings=settings.follower if vehicle.index else settings.leader,
+                slots=settings.slots,
+                start=deployed(vehicle),
+                folder=Path(folder),
             )
-            remotes[vehicle.index] = Remote(link, vehicle)
+            remote = processes.enter_context(closing(Remote(vehicle, aboard)))
+            remotes[vehicle.index] = remote
         rows: list[Row] = []
 
         def watch(now_s: float) -> None:
-            if now_s == 0.0 or (now_s % 3600.0 and now_s != duration_s):
+            if now_s == 0.0 or (now_s % 3600.0 and now_s != scenario.duration_s):
                 return
-            steps = round((now_s - (rows[-1].hours * 3600.0 if rows else 0.0)) * rate_hz)
+            steps = round((now_s - (rows[-1].hours * 3600.0 if rows else 0.0)) * scenario.ping_hz)
             costs_ms = 1e3 * np.array(remotes[0].costs_s[-steps:])
             leader, true_m = remotes[0].gauge(now_s), vehicles[0].true_position(now_s)
             rows.append(
@@ -138,16 +160,12 @@ def mission(settings: MissionSettings, terrain: Path | None, seed: int) -> Itera
         run(
             remotes,
             water_between(settings, vehicles, seed),
-            duration_s=duration_s,
-            tick_s=1.0 / rate_hz,
+            duration_s=scenario.duration_s,
+            tick_s=1.0 / scenario.ping_hz,
             record=lambda _: None,
             progress=watch,
         )
-        yield from rows
-        yield remotes[0].gauge(duration_s, compare=True)
-        for remote, process in zip(remotes.values(), processes, strict=True):
-            remote.close()
-            process.wait()
+        return rows, remotes[0].gauge(scenario.duration_s, compare=True).position_m
 
 
 def draw(rows: list[Row], path: Path) -> None:
@@ -179,13 +197,11 @@ def main() -> None:
         settings_of(arguments), {"duration_min": minutes, "follower_duration_min": minutes}
     )
     print(HEAD)
-    *rows, end = mission(settings, arguments.terrain, arguments.seed)
-    hours = [row for row in rows if isinstance(row, Row)]
+    hours, batch_m = mission(settings, arguments.terrain, arguments.seed)
     if len(hours) > 2:
         ratio = hours[-1].steps_ms[1] / hours[1].steps_ms[1]
         print(f"99 % of the last hour's steps over that of the second: {ratio:.2f}")
-    assert isinstance(end, Gauge)
-    print(f"incremental against batch, farthest node: {end.position_m.max():.4f} m")
+    print(f"incremental against batch, farthest node: {batch_m.max():.4f} m")
     if arguments.plot:
         draw(hours, arguments.plot)
 

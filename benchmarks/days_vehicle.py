@@ -1,8 +1,9 @@
 """A vehicle of `benchmarks.days`: a process of its own that imports only what is aboard.
 
-    python -m benchmarks.days_vehicle ADDRESS
+    python -m benchmarks.days_vehicle FD
 
-connects to the mission, is told what it is, and then answers orders until there are no more.
+has a link to the mission at this descriptor, is told what it is, and then answers orders until
+there are no more.
 """
 
 import resource
@@ -10,7 +11,7 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from multiprocessing.connection import Client, Connection
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -144,5 +145,5 @@ def _node(aboard: Aboard, journal: Journal, orders: "_Orders") -> LeaderNode | F
 
 
 if __name__ == "__main__":
-    with Client(sys.argv[1]) as mission:
+    with Connection(int(sys.argv[1])) as mission:
         serve(mission)

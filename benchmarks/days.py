@@ -1,10 +1,11 @@
-"""What a long mission costs: the leader's time per step, and both vehicles' memory, hour by hour.
+"""What a long mission costs: time per step, processor and memory, hour by hour.
 
     python -m benchmarks.days --hours 3 [--plot days.png] [--terrain FILE] [--seed 1] [--set ...]
 
 runs `day-1`, shortened to the hours given (1, 3, 10, 24). Every vehicle is a process of its own, as
 aboard, with a store; so its resident memory is its own. A step is a quarter of a second: sensors,
-frames, matches, estimate and answer. Costs are of the processor, not of the clock.
+frames, matches, estimate and answer. Costs are of the processor, not of the clock: of steps that
+of their thread, of a minute of the mission that of the whole process.
 """
 
 import argparse
@@ -89,10 +90,12 @@ class Remote:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """One hour, or what there is of it."""
+    """One hour, or what there is of it; a follower's figures are those of the costliest."""
 
     hours: float
-    steps_ms: np.ndarray  # (median, 99 %, 99.9 %, longest)
+    steps_ms: np.ndarray  # the leader's: (median, 99 %, 99.9 %, longest)
+    leader_cpu_s: float  # a minute of the mission
+    follower_cpu_s: float  # a minute of the mission
     leader: Gauge
     follower_mb: float
     miss_m: float  # of the leader's belief
@@ -100,9 +103,10 @@ class Row:
 
 HEAD = (
     f"{'hour':>5} {'median':>8} {'99 %':>7} {'99.9 %':>7} {'longest':>8} {'leader':>7} "
-    f"{'follower':>8} {'nodes':>6} {'records':>8} {'active':>7} {'matched':>8} {'error':>6}\n"
-    f"{'':>5} {'ms':>8} {'ms':>7} {'ms':>7} {'ms':>8} {'MB':>7} "
-    f"{'MB':>8} {'':>6} {'':>8} {'':>7} {'sheets':>8} {'m':>6}"
+    f"{'follower':>8} {'leader':>7} {'follower':>8} {'nodes':>6} {'records':>8} {'active':>7} "
+    f"{'matched':>8} {'error':>6}\n"
+    f"{'':>5} {'ms':>8} {'ms':>7} {'ms':>7} {'ms':>8} {'s/min':>7} "
+    f"{'s/min':>8} {'MB':>7} {'MB':>8} {'':>6} {'':>8} {'':>7} {'sheets':>8} {'m':>6}"
 )
 
 
@@ -111,8 +115,26 @@ def _line(row: Row) -> str:
     g = row.leader
     return (
         f"{row.hours:5.1f} {median:8.2f} {p99:7.1f} {p999:7.1f} {longest:8.0f} "
+        f"{row.leader_cpu_s:7.2f} {row.follower_cpu_s:8.2f} "
         f"{g.resident_mb:7.0f} {row.follower_mb:8.0f} {g.nodes:6d} {g.records:8d} "
         f"{g.closures:7d} {g.sheets:8d} {row.miss_m:6.2f}"
+    )
+
+
+def _row(
+    before: list[Gauge], after: list[Gauge], costs_s: list[float], true_m: tuple[float, float]
+) -> Row:
+    """Return what happened between two gauges of all vehicles; the leader comes first."""
+    minutes = (after[0].time_s - before[0].time_s) / 60.0
+    cpu_s = [(b.cpu_s - a.cpu_s) / minutes for a, b in zip(before, after, strict=True)]
+    return Row(
+        hours=after[0].time_s / 3600.0,
+        steps_ms=np.percentile(1e3 * np.array(costs_s), [50.0, 99.0, 99.9, 100.0]),
+        leader_cpu_s=cpu_s[0],
+        follower_cpu_s=max(cpu_s[1:]),
+        leader=after[0],
+        follower_mb=max(gauge.resident_mb for gauge in after[1:]),
+        miss_m=float(np.hypot(*(after[0].position_m - np.array(true_m)))),
     )
 
 
@@ -139,22 +161,15 @@ def mission(
             remote = processes.enter_context(closing(Remote(vehicle, aboard)))
             remotes[vehicle.index] = remote
         rows: list[Row] = []
+        gauges = [[remote.gauge(0.0) for remote in remotes.values()]]
 
         def watch(now_s: float) -> None:
             if now_s == 0.0 or (now_s % 3600.0 and now_s != scenario.duration_s):
                 return
-            steps = round((now_s - (rows[-1].hours * 3600.0 if rows else 0.0)) * scenario.ping_hz)
-            costs_ms = 1e3 * np.array(remotes[0].costs_s[-steps:])
-            leader, true_m = remotes[0].gauge(now_s), vehicles[0].true_position(now_s)
-            rows.append(
-                Row(
-                    hours=now_s / 3600.0,
-                    steps_ms=np.percentile(costs_ms, [50.0, 99.0, 99.9, 100.0]),
-                    leader=leader,
-                    follower_mb=max((r.gauge(now_s).resident_mb for v, r in remotes.items() if v)),
-                    miss_m=float(np.hypot(*(leader.position_m - true_m[:2]))),
-                )
-            )
+            gauges.append([remote.gauge(now_s) for remote in remotes.values()])
+            true_m = vehicles[0].true_position(now_s)[:2]
+            rows.append(_row(gauges[-2], gauges[-1], remotes[0].costs_s, true_m))
+            remotes[0].costs_s.clear()
             print(_line(rows[-1]), flush=True)
 
         run(
@@ -166,6 +181,12 @@ def mission(
             progress=watch,
         )
         return rows, remotes[0].gauge(scenario.duration_s, compare=True).position_m
+
+
+def lasting(settings: MissionSettings, hours: float) -> MissionSettings:
+    """Return the settings of a mission in which all vehicles survey for some hours."""
+    minutes = 60.0 * hours
+    return changed(settings, {"duration_min": minutes, "follower_duration_min": minutes})
 
 
 def draw(rows: list[Row], path: Path) -> None:
@@ -192,10 +213,7 @@ def main() -> None:
     parser.add_argument("--hours", type=float, default=3.0)
     parser.add_argument("--plot", type=Path, help="a .png or .svg")
     arguments = parser.parse_args()
-    minutes = 60.0 * arguments.hours
-    settings = changed(
-        settings_of(arguments), {"duration_min": minutes, "follower_duration_min": minutes}
-    )
+    settings = lasting(settings_of(arguments), arguments.hours)
     print(HEAD)
     hours, batch_m = mission(settings, arguments.terrain, arguments.seed)
     if len(hours) > 2:

@@ -46,6 +46,8 @@ class Gauge:
     position_m is its belief (2,), or, where estimates were compared, their distances (T,).
     """
 
+    time_s: float
+    cpu_s: float  # of all threads since the process began
     resident_mb: float
     position_m: np.ndarray
     nodes: int = 0
@@ -83,7 +85,7 @@ def serve(link: Connection) -> None:
     with threadpool_limits(1):
         while (order := link.recv()) is not None:
             if order.gauge or order.compare:
-                link.send(_gauge(node, compare=order.compare))
+                link.send(_gauge(node, order.now_s, compare=order.compare))
                 continue
             began_s = time.thread_time()
             for heard in order.heard:
@@ -105,11 +107,13 @@ class _Orders(Iterator[SensorStep]):
         return self.step
 
 
-def _gauge(node: LeaderNode | FollowerNode, *, compare: bool) -> Gauge:
+def _gauge(node: LeaderNode | FollowerNode, now_s: float, *, compare: bool) -> Gauge:
+    cpu_s = time.process_time()
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     resident_mb = pages * PAGE_BYTES / 1e6
     if isinstance(node, FollowerNode):
-        return Gauge(resident_mb=resident_mb, position_m=node.core.belief().position_m)
+        position_m = node.core.belief().position_m
+        return Gauge(time_s=now_s, cpu_s=cpu_s, resident_mb=resident_mb, position_m=position_m)
     core = node.core
     if compare:
         before_m = np.concatenate([core.trajectory(v).position_m for v in core.vehicles()])
@@ -119,6 +123,8 @@ def _gauge(node: LeaderNode | FollowerNode, *, compare: bool) -> Gauge:
     else:
         position_m = core.belief().position_m
     return Gauge(
+        time_s=now_s,
+        cpu_s=cpu_s,
         resident_mb=resident_mb,
         nodes=core.graph.nodes,
         records=core.graph.records,
@@ -145,5 +151,7 @@ def _node(aboard: Aboard, journal: Journal, orders: "_Orders") -> LeaderNode | F
 
 
 if __name__ == "__main__":
+    from benchmarks import days_vehicle  # so that what is sent is not of a __main__ of its own
+
     with Connection(int(sys.argv[1])) as mission:
-        serve(mission)
+        days_vehicle.serve(mission)

@@ -110,7 +110,7 @@ def test_a_mission_of_small_lattice_frames_on_emulated_nanomodems(tmp_path: Path
     leader = json.loads((tmp_path / "processes" / "leader.json").read_text())
     assert leader.get("submaps_not_rebuilt", 0) <= 1  # the last one may be cut
     follower = json.loads((tmp_path / "processes" / "follower_1.json").read_text())
-    assert follower["answers_used"] >= 10
+    assert follower["answers_used"] + follower["answers_without_news"] >= 10
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["closures"]["active"]["number"] >= 5
 

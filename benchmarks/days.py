@@ -185,7 +185,7 @@ def mission(
 
 def lasting(settings: MissionSettings, hours: float) -> MissionSettings:
     """Return the settings of a mission in which all vehicles survey for some hours."""
-    minutes = 60.0 * hours
+    minutes = round(3600.0 * hours) / 60.0  # whole seconds: an hour's end is a tick
     return changed(settings, {"duration_min": minutes, "follower_duration_min": minutes})
 
 

@@ -136,8 +136,7 @@ class DriftFilter:
         design[0, :2], design[0, 6:8] = -direction, lasting * one.leader_sigma_m * direction
         # beyond the first order: across the range, the position's uncertainty bends it
         across_m2 = float(np.trace(state.covariance[:2, :2])) / predicted_m
-        range_m2 = s.range_sigma_m**2 * (
-            1.0 + (one.apart_m / predicted_m) ** 2
-        )  # across, not along
+        steepness = one.apart_m / predicted_m  # noise counts for more across than along a slant
+        range_m2 = s.range_sigma_m**2 * (1.0 + steepness**2)
         variance_m2 = range_m2 + (fresh * one.leader_sigma_m) ** 2 + across_m2**2 / 4
         return np.array([one.range_m - predicted_m]), design, np.array([[variance_m2]])

@@ -25,7 +25,7 @@ class _HeldRange:
     sent_s: float
     arrived_s: float
     range_m: float
-    apart_m: float
+    apart_m: float  # in depth
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,7 +37,7 @@ class _PlacedRange:
 
     sender: int
     range_m: float
-    apart_m: float
+    apart_m: float  # in depth
     clock_m: float
     clock_sigma_m: float
     here: Anchor

@@ -19,6 +19,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from firmware.dead_reckoning import ReckonedState
+from firmware.heap import give_back_large_blocks
 from firmware.journal import Journal, JournalSettings, Owner
 from firmware.ports import SensorStep
 from host_tools.nodes import BeliefLog, FollowerNode, LeaderNode
@@ -153,5 +154,6 @@ def _node(aboard: Aboard, journal: Journal, orders: "_Orders") -> LeaderNode | F
 if __name__ == "__main__":
     from benchmarks import days_vehicle  # so that what is sent is not of a __main__ of its own
 
+    give_back_large_blocks()
     with Connection(int(sys.argv[1])) as mission:
         days_vehicle.serve(mission)

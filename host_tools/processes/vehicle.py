@@ -17,6 +17,7 @@ from firmware.boot_epochs import BOOT_EPOCHS, LIFE_S
 from firmware.clock import WallClock
 from firmware.follower.core import FollowerCore
 from firmware.follower.loop import FollowerLoop
+from firmware.heap import give_back_large_blocks
 from firmware.leader.core import LeaderCore
 from firmware.leader.loop import LeaderLoop
 from firmware.leader.worker import InlineWorker, ThreadWorker, Worker
@@ -326,6 +327,7 @@ def _run(vehicle: int, arguments: argparse.Namespace, voyage: Voyage) -> None:
     a = arguments
     if a.encrypt and a.key is None:
         raise ConfigError("--encrypt needs --key FILE, and the same at every vehicle")
+    give_back_large_blocks()
     run_vehicle(
         vehicle, a.modem, a.clock, voyage, a.out, a.start, a.store, a.key, encrypts=a.encrypt
     )

@@ -15,8 +15,8 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of glibc's <malloc.h>
 def give_back_large_blocks() -> bool:
     """Tell the C library to return large blocks as soon as they are free; return whether it will.
 
-    Call it before work begins. Elsewhere than on Linux, and on a C library without `mallopt` or
-    whose `mallopt` changes nothing, as musl's, nothing happens.
+    Call it before work begins. Elsewhere than on Linux, or on a C library without `mallopt`,
+    nothing happens.
     """
     if not sys.platform.startswith("linux"):
         return False

@@ -9,6 +9,7 @@ reckoning itself.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -82,6 +83,14 @@ class DriftCorrection:
         self.ranges_accepted = 0
         self.ranges_gated = 0
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a checkpoint holds: what was seen, but not the states, which follow."""
+        return {**self.__dict__, "_seen": [filtered.one for filtered in self._seen]}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _seen=[])
+        self._filter_on(state["_seen"])
+
     def receive_answer(
         self, time_s: float, reckoned_m: Array, answered_m: Array, sigma_m: float | None = None
     ) -> bool:
@@ -147,10 +156,11 @@ class DriftCorrection:
         """Return the believed position (2,) at the time, and its covariance (2, 2)."""
         newest = self._seen[-1].state if self._seen else self._base
         state = self._filter.predicted(newest, max(time_s, newest.time_s))
-        covariance_m2 = state.covariance[:2, :2]
+        mean, covariance = state.blended()
+        covariance_m2 = covariance[:2, :2]
         if self._echo:
             covariance_m2 = covariance_m2 + self._alone_m2(time_s) * np.eye(2)
-        return np.asarray(reckoned_m - state.mean[:2]), covariance_m2
+        return np.asarray(reckoned_m - mean[:2]), covariance_m2
 
     def _state_at(self, time_s: float) -> DriftState:
         """Return the state after all that was seen up to the time."""
@@ -202,7 +212,7 @@ class DriftCorrection:
     def _alone_m2(self, time_s: float) -> float:
         """Return the variance of dead reckoning that nobody corrects, along one axis."""
         at_s = max(time_s, self._deployment.time_s)
-        return float(self._filter.predicted(self._deployment, at_s).covariance[0, 0])
+        return float(self._filter.predicted(self._deployment, at_s).blended()[1][0, 0])
 
     def _is_echo(self, time_s: float, ran_away_m: Array, alone_m2: float) -> bool:
         """Return whether an answer that tells no variance may be our dead reckoning again.

@@ -1,8 +1,13 @@
-"""A Kalman filter over drift: how far dead reckoning ran away, how fast, and the leader's errors.
+"""A bank of Kalman filters over drift: how far dead reckoning ran away, how fast, and other errors.
 
 The state is (c, b, u, v), each with north and east: c in metres and b in metres a second are
 dead reckoning's; u is the error of the leader's answers and v that of its own position, both in
 units of the sigma that is told with them, each wandering with a correlation time.
+
+How much b wanders differs from sea to sea, and nobody knows it beforehand. Each filter of the bank
+takes another walk for granted, and has the weight that what was seen gives to it: multiple-model
+estimation, Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and
+Navigation", 2001, section 11.6.2.
 """
 
 from dataclasses import dataclass
@@ -11,6 +16,9 @@ import numpy as np
 
 from firmware.geometry import Array
 from protocol.settings import Settings, setting
+
+_WALKS = np.geomspace(1 / 16, 16.0, 9)  # of the believed one, a filter each
+_BELIEVED = 4  # which of them takes that itself
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -21,6 +29,12 @@ class DriftSettings(Settings):
     odometry_noise: float = setting(0.2, "m/sqrt(s)", "random part of dead reckoning", minimum=1e-4)
     bias_sigma_mps: float = setting(0.15, "m/s", "unmeasured current at the start", minimum=1e-4)
     bias_walk: float = setting(0.004, "m/s/sqrt(s)", "how the current wanders", minimum=1e-7)
+    walk_factor: float = setting(
+        2.0, "1", "by which that may well be wrong, until answers tell", minimum=1.01
+    )
+    walk_memory_s: float = setting(
+        3600.0, "s", "in which what they told of it fades: tides turn", minimum=60.0
+    )
     answers_alike_s: float = setting(
         150.0, "s", "errors of answers are alike for half a survey line, between closures",
         minimum=1.0,
@@ -57,68 +71,107 @@ class RangeSeen:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DriftState:
-    """Mean (8,) and covariance (8, 8) at a time."""
+    """Means (W, 8) and covariances (W, 8, 8) of the bank at a time, and log weights (W,)."""
 
     time_s: float
-    mean: Array
-    covariance: Array
+    means: Array
+    covariances: Array
+    log_weights: Array
+
+    def blended(self) -> tuple[Array, Array]:
+        """Return mean (8,) and covariance (8, 8) of all filters together."""
+        weights = np.exp(self.log_weights - self.log_weights.max())
+        weights /= weights.sum()
+        mean = weights @ self.means
+        apart = self.means - mean
+        covariance = np.tensordot(weights, self.covariances, axes=1)
+        return mean, covariance + (weights * apart.T) @ apart
 
 
 class DriftFilter:
-    """The filter's steps, from state to state; it keeps nothing."""
+    """The filters' steps, from state to state; it keeps nothing."""
 
     def __init__(self, settings: DriftSettings) -> None:
         self._settings = settings
+        self._walks = settings.bias_walk * _WALKS
+        spread = np.log(settings.walk_factor)
+        self._log_prior = -0.5 * (np.log(_WALKS) / spread + spread) ** 2
 
     def deployed(self, time_s: float) -> DriftState:
         """Return what is known at a start; a later one than the mission's has drifted since.
 
         A vehicle that begins without its past, its store gone, begins where dead reckoning is.
+        Walks are log-normal about the believed one, which is the root of their mean square.
         """
-        s = self._settings
+        s, size = self._settings, len(_WALKS)
         sigmas = np.repeat([s.start_sigma_m, s.bias_sigma_mps, 1.0, 1.0], 2)
-        first_s = min(time_s, 0.0)
-        state = DriftState(time_s=first_s, mean=np.zeros(8), covariance=np.diag(sigmas**2))
+        state = DriftState(
+            time_s=min(time_s, 0.0),
+            means=np.zeros((size, 8)),
+            covariances=np.tile(np.diag(sigmas**2), (size, 1, 1)),
+            log_weights=self._log_prior,
+        )
         return self.predicted(state, time_s)
 
     def updated(self, state: DriftState, one: AnswerSeen | RangeSeen) -> DriftState:
         """Return the state after something seen, at its time."""
         state = self.predicted(state, max(one.time_s, state.time_s))
-        innovation, design, noise = self._measured(state, one)
-        spread = design @ state.covariance @ design.T + noise
-        gain = np.linalg.solve(spread, design @ state.covariance).T
+        seen = [
+            self._measured(mean, covariance, one)
+            for mean, covariance in zip(state.means, state.covariances, strict=True)
+        ]
+        innovation, design, noise = (np.stack(part) for part in zip(*seen, strict=True))
+        across = design @ state.covariances
+        spread = across @ design.mT + noise
+        gain = np.linalg.solve(spread, across).mT
         keep = np.eye(8) - gain @ design
+        missed = np.linalg.solve(spread, innovation[..., None])[..., 0]
+        log_likely = -0.5 * (np.linalg.slogdet(spread)[1] + (innovation * missed).sum(axis=1))
         return DriftState(
             time_s=state.time_s,
-            mean=state.mean + gain @ innovation,
-            covariance=keep @ state.covariance @ keep.T + gain @ noise @ gain.T,
+            means=state.means + (gain @ innovation[..., None])[..., 0],
+            covariances=keep @ state.covariances @ keep.mT + gain @ noise @ gain.mT,
+            log_weights=state.log_weights + log_likely,
         )
 
     def chi_square(self, state: DriftState, one: AnswerSeen | RangeSeen) -> float:
-        """Return the squared innovation of something seen, in units of its covariance."""
+        """Return the squared innovation of something seen, in units of its covariance.
+
+        It is the least of two: by all that was learned, and by the filter that still believes what
+        was believed at first. What speaks for a tide that begins to turn must not be kept out by
+        the stillness before it.
+        """
         state = self.predicted(state, max(one.time_s, state.time_s))
-        innovation, design, noise = self._measured(state, one)
-        spread = design @ state.covariance @ design.T + noise
-        return float(innovation @ np.linalg.solve(spread, innovation))
+        squares = []
+        for mean, covariance in (
+            state.blended(),
+            (state.means[_BELIEVED], state.covariances[_BELIEVED]),
+        ):
+            innovation, design, noise = self._measured(mean, covariance, one)
+            spread = design @ covariance @ design.T + noise
+            squares.append(float(innovation @ np.linalg.solve(spread, innovation)))
+        return min(squares)
 
     def predicted(self, state: DriftState, time_s: float) -> DriftState:
         """Return the state at a later time."""
         s, interval_s = self._settings, time_s - state.time_s
-        alike = float(np.exp(-interval_s / s.answers_alike_s))
+        alike, kept = np.exp(-interval_s / np.array([s.answers_alike_s, s.walk_memory_s]))
         transition = np.diag([1.0, 1.0, 1.0, 1.0, alike, alike, alike, alike])
         transition[:2, 2:4] = interval_s * np.eye(2)
-        walk = s.bias_walk**2
-        position_m2 = s.odometry_noise**2 * interval_s + walk * interval_s**3 / 3
-        noise = np.diag(np.repeat([position_m2, walk * interval_s, 1 - alike**2, 1 - alike**2], 2))
-        noise[[0, 1, 2, 3], [2, 3, 0, 1]] = walk * interval_s**2 / 2
+        fresh = np.diag([s.odometry_noise**2 * interval_s, 0.0, 1 - alike**2, 1 - alike**2])
+        wandered = np.zeros((4, 4))
+        wandered[:2, :2] = np.array([[interval_s**2 / 3, interval_s / 2], [interval_s / 2, 1.0]])
+        wandered *= interval_s
+        noise = fresh + self._walks[:, None, None] ** 2 * wandered
         return DriftState(
             time_s=time_s,
-            mean=transition @ state.mean,
-            covariance=transition @ state.covariance @ transition.T + noise,
+            means=state.means @ transition.T,
+            covariances=transition @ state.covariances @ transition.T + np.kron(noise, np.eye(2)),
+            log_weights=self._log_prior + kept * (state.log_weights - self._log_prior),
         )
 
     def _measured(
-        self, state: DriftState, one: AnswerSeen | RangeSeen
+        self, mean: Array, covariance: Array, one: AnswerSeen | RangeSeen
     ) -> tuple[Array, Array, Array]:
         """Return innovation (M,), design (M, 8) and noise (M, M) of something seen."""
         s, fresh = self._settings, self._settings.fresh_share
@@ -127,15 +180,15 @@ class DriftFilter:
             design = np.zeros((2, 8))
             design[:, :2], design[:, 4:6] = np.eye(2), lasting * one.sigma_m * np.eye(2)
             noise = (fresh * one.sigma_m) ** 2 * np.eye(2)
-            return one.ran_away_m - design @ state.mean, design, noise
-        leader_error_m = lasting * one.leader_sigma_m * state.mean[6:8]
-        between_m = one.reckoned_m - state.mean[:2] - (one.leader_m - leader_error_m)
+            return one.ran_away_m - design @ mean, design, noise
+        leader_error_m = lasting * one.leader_sigma_m * mean[6:8]
+        between_m = one.reckoned_m - mean[:2] - (one.leader_m - leader_error_m)
         predicted_m = max(float(np.hypot(*between_m)), 1.0)
         direction = between_m / predicted_m
         design = np.zeros((1, 8))
         design[0, :2], design[0, 6:8] = -direction, lasting * one.leader_sigma_m * direction
         # beyond the first order: across the range, the position's uncertainty bends it
-        across_m2 = float(np.trace(state.covariance[:2, :2])) / predicted_m
+        across_m2 = float(np.trace(covariance[:2, :2])) / predicted_m
         steepness = one.apart_m / predicted_m  # noise counts for more across than along a slant
         range_m2 = s.range_sigma_m**2 * (1.0 + steepness**2)
         variance_m2 = range_m2 + (fresh * one.leader_sigma_m) ** 2 + across_m2**2 / 4

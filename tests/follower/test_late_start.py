@@ -17,7 +17,7 @@ def sigma_m(correction: DriftCorrection, time_s: float) -> float:
 
 def test_a_follower_begun_anew_is_as_uncertain_as_one_that_nobody_corrected() -> None:
     anew, alone = DriftCorrection(200.0, SETTINGS), DriftCorrection(0.0, SETTINGS)
-    assert sigma_m(alone, 0.0) == SETTINGS.start_sigma_m
+    assert sigma_m(alone, 0.0) == pytest.approx(SETTINGS.start_sigma_m)
     for time_s in (200.0, 500.0):
         assert sigma_m(anew, time_s) == pytest.approx(sigma_m(alone, time_s), rel=1e-9)
     assert sigma_m(anew, 200.0) > 30.0

@@ -61,6 +61,14 @@ class Protection:
         return int(k[k <= frames].sum())
 
 
+def frames_for_all(body: bytes) -> int | None:
+    """Return how many frames give the whole stream, as one body says; None for one that can't."""
+    try:
+        return Protection.from_bytes(body).thresholds[2]
+    except RemoteProtocolError:
+        return None
+
+
 def bodies_of(
     shared: bytes, stream: bytes, protection: Protection, size: int, frames: int
 ) -> list[bytes]:

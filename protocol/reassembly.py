@@ -1,14 +1,16 @@
 """Fragments to sub-maps, when some are lost, repeated, late, mixed or from before a restart.
 
 A fixed number of slots, each one sub-map of one vehicle in one boot epoch. A transfer is handed on
-when it is complete, when a newer one of its vehicle has been on the air for a while, when it has
-grown too old, or when its slot is needed: always with what has arrived, never twice.
+when it is complete or has enough fragments to give all that the others would, when a newer one of
+its vehicle has been on the air for a while, when it has grown too old, or when its slot is needed:
+always with what has arrived, never twice.
 """
 
 from collections import OrderedDict, deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from protocol.lattice import frames_for_all
 from protocol.packets import Profile, SubmapFragment, SubmapPacket
 from protocol.settings import Settings, setting
 from protocol.timestamps import QUARTERS_MODULO
@@ -28,9 +30,9 @@ class ReassemblySettings(Settings):
         10, "transfers", "five vehicles, a current and an overtaken sub-map each", minimum=1
     )
     overtaken_s: float = setting(
-        30.0,
+        10.0,
         "s",
-        "after a newer sub-map began: two slots of repeats and the longest travel time",
+        "after a newer sub-map began: frames of one vehicle keep their order, or nearly",
         minimum=0.0,
     )
     repeated_s: float = setting(
@@ -69,7 +71,11 @@ class FragmentArrived:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SubmapTransfer:
-    """A sub-map as far as it came; reason: complete, overtaken, too-old, evicted or flushed."""
+    """A sub-map as far as it came.
+
+    reason: complete, enough (the others would tell nothing new), overtaken, too-old, evicted or
+    flushed.
+    """
 
     vehicle: int
     boot_epoch: int
@@ -97,11 +103,16 @@ ReassemblyEvent = FragmentArrived | SubmapTransfer
 
 @dataclass(slots=True, kw_only=True)
 class ReassemblyCounters:
-    """What became of fragments and transfers, for the status line; `open` is how many are."""
+    """What became of fragments and transfers, for the status line; `open` is how many are.
+
+    Transfers that had enough count as complete; a fragment of a closed transfer is spare where
+    that lacked nothing, else late.
+    """
 
     accepted: int = 0
     duplicates: int = 0
     late: int = 0
+    spare: int = 0
     conflicting: int = 0
     restarted: int = 0
     complete: int = 0
@@ -109,6 +120,14 @@ class ReassemblyCounters:
     evicted: int = 0
     events_dropped: int = 0
     open: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class _Closed:
+    """A transfer that was handed on: the time of one of its slices, and whether it lacked any."""
+
+    time_quarters: int
+    lacked: bool
 
 
 @dataclass(slots=True)
@@ -121,6 +140,12 @@ class _Slot:
     fragments: dict[int, Fragment] = field(default_factory=dict)
     overtaken_at_s: float | None = None
 
+    @property
+    def enough(self) -> int | None:
+        """How many fragments tell as much as all; none where each tells something of its own."""
+        first = self.first
+        return frames_for_all(first.body) if isinstance(first, SubmapFragment) else None
+
 
 class Reassembler:
     """Fragments in by `receive`, time in by `advance`, transfers out by `next_event`."""
@@ -129,7 +154,7 @@ class Reassembler:
         self.counters = ReassemblyCounters()
         self._settings = settings
         self._slots: OrderedDict[Key, _Slot] = OrderedDict()
-        self._closed: OrderedDict[Key, int] = OrderedDict()  # to the time of one of its slices
+        self._closed: OrderedDict[Key, _Closed] = OrderedDict()
         self._events: deque[ReassemblyEvent] = deque()
 
     def receive(self, packet: Fragment, arrival_s: float) -> None:
@@ -137,9 +162,11 @@ class Reassembler:
         self.advance(arrival_s)
         header = packet.header
         key = (header.vehicle, header.boot_epoch, header.submap)
-        if key in self._closed:
-            if self._is_same_time(self._closed[key], header.time_quarters):
-                self.counters.late += 1
+        closed = self._closed.get(key)
+        if closed is not None:
+            if self._is_same_time(closed.time_quarters, header.time_quarters):
+                self.counters.late += closed.lacked
+                self.counters.spare += not closed.lacked
                 return
             del self._closed[key]
             self.counters.restarted += 1
@@ -177,14 +204,16 @@ class Reassembler:
         """Return the oldest open transfer of a vehicle and the bitmap of what it still lacks.
 
         Bit i stands for fragment i. Fragments after the last one heard are not asked for while the
-        transfer is the vehicle's newest: they may still be on their way.
+        transfer is the vehicle's newest: they may still be on their way; nor are more of them than
+        it takes to have enough.
         """
         for key, slot in self._slots.items():
             if key[0] != vehicle:
                 continue
             count = slot.first.header.fragment_count
             end = count if slot.overtaken_at_s is not None else max(slot.fragments)
-            bitmap = sum(1 << i for i in range(end) if i not in slot.fragments)
+            lacking = [i for i in range(end) if i not in slot.fragments]
+            bitmap = sum(1 << i for i in lacking[: (slot.enough or count) - len(slot.fragments)])
             if bitmap:
                 return key, bitmap
         return None
@@ -218,17 +247,18 @@ class Reassembler:
         self._push(FragmentArrived(fragment=packet, arrival_s=arrival_s))
         if len(slot.fragments) == first.fragment_count:
             self._close(key, "complete")
+        elif len(slot.fragments) == slot.enough:
+            self._close(key, "enough")
 
     def _close(self, key: Key, reason: str) -> None:
         slot = self._slots.pop(key)
         self.counters.open = len(self._slots)
-        if reason == "complete":
-            self.counters.complete += 1
-        else:
-            self.counters.partial += 1
+        lacked = reason not in {"complete", "enough"}
+        self.counters.partial += lacked
+        self.counters.complete += not lacked
         while len(self._closed) >= self._settings.remembered:
             self._closed.popitem(last=False)
-        self._closed[key] = slot.first.header.time_quarters
+        self._closed[key] = _Closed(slot.first.header.time_quarters, lacked)
         vehicle, boot_epoch, submap = key
         self._push(
             SubmapTransfer(

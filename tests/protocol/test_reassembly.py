@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol.packets import SubmapPacket
+from protocol.lattice import Protection, bodies_of, stream_of
+from protocol.packets import BODY_BYTES, Profile, SubmapFragment, SubmapPacket
 from protocol.reassembly import (
     FragmentArrived,
     Reassembler,
@@ -103,8 +104,42 @@ def test_duplicates_and_late_fragments_are_counted_and_change_nothing() -> None:
         reassembler.receive(packet, 0.0)
     assert len(transfers(reassembler)) == 1
     assert reassembler.counters.duplicates == 1
-    assert reassembler.counters.late == 1
+    assert reassembler.counters.spare == 1
     assert events(reassembler) == []
+
+
+def test_a_fragment_of_a_transfer_that_was_closed_without_it_is_late() -> None:
+    reassembler = Reassembler(SETTINGS)
+    sent = submap(3)
+    for packet in sent[:9]:
+        reassembler.receive(packet, 0.0)
+    reassembler.receive(sent[9], SETTINGS.oldest_s)
+    assert [t.missing for t in transfers(reassembler)] == [(9,)]
+    assert (reassembler.counters.late, reassembler.counters.spare) == (1, 0)
+
+
+def test_a_lattice_is_handed_on_as_soon_as_others_would_tell_nothing_new() -> None:
+    """The first six frames that arrive give every column; no more than these are asked for."""
+    stream = bytes(range(200)) * 7
+    protection = Protection(thresholds=(2, 4, 6), columns=(20, 60))
+    bodies = bodies_of(b"", stream[:1200], protection, BODY_BYTES[Profile.SUBMAP_LATTICE], 10)
+    reassembler = Reassembler(SETTINGS)
+    for index in (9, 1, 3, 4, 7, 8, 2):
+        header = replace(submap(5)[index].header, profile=Profile.SUBMAP_LATTICE, time_quarters=100)
+        reassembler.receive(SubmapFragment(header=header, body=bodies[index]), 4.0 * index)
+        if index == 7:
+            assert reassembler.missing(1) == ((1, 0, 5), 1 << 0)
+    (transfer,) = transfers(reassembler)
+    assert (transfer.reason, sorted(transfer.fragments)) == ("enough", [1, 3, 4, 7, 8, 9])
+    arrived = {
+        index: fragment.body
+        for index, fragment in transfer.fragments.items()
+        if isinstance(fragment, SubmapFragment)
+    }
+    assert stream_of(arrived, 0, 10).startswith(stream[:1200])
+    assert (reassembler.counters.complete, reassembler.counters.spare) == (1, 1)
+    assert reassembler.counters.partial == 0
+    assert reassembler.missing(1) is None
 
 
 @given(st.permutations(range(10)))
@@ -261,5 +296,6 @@ def test_whatever_comes_nothing_is_handed_on_twice_and_memory_is_bounded(
         handed_on += [id(f) for f in transfer.fragments.values()]
     assert sorted(accepted) == sorted(handed_on)
     counters = reassembler.counters
-    dropped = counters.duplicates + counters.late + counters.conflicting
+    closed = counters.late + counters.spare
+    dropped = counters.duplicates + closed + counters.conflicting
     assert counters.accepted + dropped == len(arrivals)

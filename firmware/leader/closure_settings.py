@@ -28,7 +28,7 @@ class ClosureSettings(Settings):
         minimum=0,
     )
     second_look_share: float = setting(
-        0.5, "1", "of the sigma at the last look: then an open pair is looked at again", minimum=0.0
+        0.7, "1", "of the radius at the last look: half the area to look for a pair in", minimum=0.0
     )
     open_submaps: int = setting(
         256, "sub-maps", "with open pairs; the longest not looked at go", minimum=1

@@ -41,6 +41,11 @@ class MatchJob:
         """How well the offset was known before the match, in its worst direction."""
         return float(np.sqrt(np.linalg.eigvalsh(self.prior_covariance_m2)[-1]))
 
+    @property
+    def prior_radius_m(self) -> float:
+        """That of a circle as large as the ellipse of one sigma in which the offset was sought."""
+        return float(np.linalg.det(self.prior_covariance_m2) ** 0.25)
+
     def run(self) -> MatchOutcome:
         """Match the pair."""
         return match(
@@ -111,17 +116,20 @@ def jobs_again(
 ) -> list[MatchJob]:
     """Return the matches of a sheet's open pairs whose offset others have told much better by now.
 
-    partners come with the sigma at the last look and the number of the hint that a look has left,
+    partners come with the radius at the last look and the number of the hint that a look has left,
     if any: what the pair itself told is taken out of what is known, lest it confirm itself. Raises
     EstimationError if the sheet itself hangs on no node.
     """
-    last_look = {other.id: (sigma_m, hint) for other, sigma_m, hint in partners}
+    last_look = {other.id: (radius_m, hint) for other, radius_m, hint in partners}
     shrunk = []
     for known in offsets_of(sheet, [other for other, _, _ in partners], estimate):
-        sigma_m, hint = last_look[known.origin.id]
+        radius_m, hint = last_look[known.origin.id]
         offset = known if hint is None else _without_hint(known, sheet, hint, estimate)
         values_m2 = np.linalg.eigvalsh(offset.covariance_m2)
-        if 0.0 < values_m2[0] and values_m2[1] <= (settings.second_look_share * sigma_m) ** 2:
+        if (
+            0.0 < values_m2[0]
+            and np.prod(values_m2) <= (settings.second_look_share * radius_m) ** 4
+        ):
             shrunk.append(offset)
     return _jobs(
         sheet,

@@ -22,9 +22,9 @@ _OPEN = (NoMatch.AMBIGUOUS, NoMatch.LOOSE)  # what a narrower prior may decide
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OpenPair:
-    """How well the offset was known at the last look, and the hint that a look left, if any."""
+    """Where the offset was sought at the last look, and the hint that a look left, if any."""
 
-    sigma_m: float
+    radius_m: float
     hint: int | None = None
 
 
@@ -40,8 +40,8 @@ class OpenPairs:
         """Remember a pair that a match left open, forget one that is none; a closure settles it."""
         pairs = self._of.get(job.target.id, {})
         if outcome.reason in _OPEN:
-            known = pairs.get(job.origin.id, OpenPair(sigma_m=job.prior_sigma_m))
-            pairs[job.origin.id] = replace(known, sigma_m=job.prior_sigma_m)
+            known = pairs.get(job.origin.id, OpenPair(radius_m=job.prior_radius_m))
+            pairs[job.origin.id] = replace(known, radius_m=job.prior_radius_m)
             self._of[job.target.id] = pairs
         elif outcome.match is None:
             self.settle(job.origin.id, job.target.id)
@@ -70,7 +70,7 @@ class OpenPairs:
     def next_turn(
         self, atlas: Atlas, graph: PoseGraph
     ) -> tuple[Sheet, list[tuple[Sheet, float, int | None]]] | None:
-        """Return the sheet whose turn it is, and its open partners with sigma in metres and hint.
+        """Return the sheet whose turn it is, and its open partners with radius in m and hint.
 
         Sheets take turns; one that is matched no more is forgotten. A partner whose hint was
         composed with others is passed over: nobody knows any more what the pair itself has told.
@@ -78,7 +78,7 @@ class OpenPairs:
         while self._of:
             target, pairs = self._of.popitem(last=False)
             partners = [
-                (atlas[origin], pair.sigma_m, pair.hint if graph.is_active(pair.hint) else None)
+                (atlas[origin], pair.radius_m, pair.hint if graph.is_active(pair.hint) else None)
                 for origin, pair in pairs.items()
                 if origin in atlas and (pair.hint is None or pair.hint in graph)
             ]

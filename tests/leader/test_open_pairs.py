@@ -52,7 +52,7 @@ def _sheet(submap: int, time_s: float = 0.0) -> Sheet:
     return sheet
 
 
-def _job(origin: Sheet, target: Sheet, sigma_m: float) -> MatchJob:
+def _job(origin: Sheet, target: Sheet, radius_m: float) -> MatchJob:
     return MatchJob(
         origin=origin,
         target=target,
@@ -61,7 +61,7 @@ def _job(origin: Sheet, target: Sheet, sigma_m: float) -> MatchJob:
         origin_drift_mps=np.zeros(2),
         target_drift_mps=np.zeros(2),
         prior_shift_m=np.zeros(2),
-        prior_covariance_m2=np.diag([1.0, sigma_m**2]),
+        prior_covariance_m2=np.diag([radius_m, radius_m]) ** 2,
         settings=MatchingSettings(),
         looks=(LOOK, LOOK),
     )
@@ -75,28 +75,39 @@ def atlas() -> Atlas:
     return atlas
 
 
+def _assert_turn(
+    pairs: OpenPairs, atlas: Atlas, graph: PoseGraph, target: Sheet, origin: Sheet, radius_m: float
+) -> None:
+    turn = pairs.next_turn(atlas, graph)
+    assert turn is not None
+    assert turn[0] is target
+    ((partner, last_m, hint),) = turn[1]
+    assert (partner, hint) == (origin, None)
+    assert last_m == pytest.approx(radius_m)
+
+
 def _sheets(atlas: Atlas) -> list[Sheet]:
     return list(atlas)
 
 
-def test_ambiguous_pair_stays_open_with_its_sigma_and_its_hint(
+def test_ambiguous_pair_stays_open_with_its_radius_and_its_hint(
     atlas: Atlas, graph: PoseGraph
 ) -> None:
     first, second, *_ = _sheets(atlas)
     pairs = OpenPairs(ClosureSettings())
-    pairs.note(_job(first, second, 9.0), AMBIGUOUS)
+    pairs.note(_job(first, second, 16.0), AMBIGUOUS)
     pairs.note_hint(first.id, second.id, None)
     pairs.note(_job(first, second, 4.0), AMBIGUOUS)
-    assert pairs.next_turn(atlas, graph) == (second, [(first, 4.0, None)])
+    _assert_turn(pairs, atlas, graph, second, first, 4.0)
 
 
 def test_settled_and_impossible_pairs_are_forgotten(atlas: Atlas, graph: PoseGraph) -> None:
     first, second, third, _ = _sheets(atlas)
     pairs = OpenPairs(ClosureSettings())
     for origin in (first, second):
-        pairs.note(_job(origin, third, 9.0), AMBIGUOUS)
+        pairs.note(_job(origin, third, 16.0), AMBIGUOUS)
     pairs.settle(first.id, third.id)
-    assert pairs.next_turn(atlas, graph) == (third, [(second, 9.0, None)])
+    _assert_turn(pairs, atlas, graph, third, second, 16.0)
     pairs.note(_job(second, third, 3.0), UNSETTLED)
     assert pairs.next_turn(atlas, graph) is None
     assert len(pairs) == 0
@@ -106,7 +117,7 @@ def test_sheets_take_turns_and_shelved_ones_are_left_out(atlas: Atlas, graph: Po
     first, second, third, fourth = _sheets(atlas)
     pairs = OpenPairs(ClosureSettings())
     for target in (second, third, fourth):
-        pairs.note(_job(first, target, 9.0), AMBIGUOUS)
+        pairs.note(_job(first, target, 16.0), AMBIGUOUS)
     atlas.shelve(third.id)
     turns = [pairs.next_turn(atlas, graph) for _ in range(3)]
     assert [turn[0].id.submap for turn in turns if turn is not None] == [1, 3, 1]
@@ -116,7 +127,7 @@ def test_longest_unseen_sheets_go_when_there_are_too_many(atlas: Atlas) -> None:
     first, second, third, fourth = _sheets(atlas)
     pairs = OpenPairs(ClosureSettings(open_submaps=2))
     for target in (second, third, fourth):
-        pairs.note(_job(first, target, 9.0), AMBIGUOUS)
+        pairs.note(_job(first, target, 16.0), AMBIGUOUS)
     assert len(pairs) == 2
     assert pairs.hint(first.id, second.id) is None
 
@@ -124,7 +135,7 @@ def test_longest_unseen_sheets_go_when_there_are_too_many(atlas: Atlas) -> None:
 def test_pair_whose_hint_was_composed_away_is_passed_over(atlas: Atlas, graph: PoseGraph) -> None:
     first, second, *_ = _sheets(atlas)
     pairs = OpenPairs(ClosureSettings())
-    pairs.note(_job(first, second, 9.0), AMBIGUOUS)
+    pairs.note(_job(first, second, 16.0), AMBIGUOUS)
     pairs.note_hint(first.id, second.id, 10_000)
     assert pairs.hint(first.id, second.id) == 10_000
     assert 10_000 not in graph
@@ -148,7 +159,7 @@ def _looks(graph: PoseGraph, then_m: float, hint: int | None = None) -> list[Mat
 
 def test_only_a_much_better_known_offset_is_worth_a_second_look(graph: PoseGraph) -> None:
     (job,) = _looks(graph, 1e6)
-    limit_m = job.prior_sigma_m / ClosureSettings().second_look_share
+    limit_m = job.prior_radius_m / ClosureSettings().second_look_share
     assert len(_looks(graph, 1.01 * limit_m)) == 1
     assert _looks(graph, 0.99 * limit_m) == []
 
@@ -169,7 +180,7 @@ def test_what_the_pair_itself_has_told_does_not_make_it_better_known(graph: Pose
         before.prior_covariance_m2, rel=1e-3, abs=1e-3
     )
     assert after.prior_shift_m == pytest.approx(before.prior_shift_m, abs=5e-2)
-    assert _looks(graph, before.prior_sigma_m, hint) == []
+    assert _looks(graph, before.prior_radius_m, hint) == []
 
 
 def test_offset_tells_drift_as_the_time_between_the_sheets_says(graph: PoseGraph) -> None:
@@ -216,7 +227,7 @@ def test_no_sheet_has_two_turns_beside_a_new_one(atlas: Atlas, graph: PoseGraph)
     first, second, third, fourth = _sheets(atlas)
     pairs = OpenPairs(ClosureSettings(second_look_share=1e6))
     for target in (second, third):
-        pairs.note(_job(first, target, 9.0), AMBIGUOUS)
+        pairs.note(_job(first, target, 16.0), AMBIGUOUS)
     atlas.shelve(second.id)
     calibrations = Calibrations(MatchingSettings())
     pairs.second_looks(fourth, atlas, graph, calibrations)

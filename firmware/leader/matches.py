@@ -1,7 +1,7 @@
 """What matching is told and what it answers: settings, a match, or the reason for none."""
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from firmware.geometry import Array
 from firmware.leader.calibration import CalibrationSettings
@@ -157,6 +157,13 @@ class Hint:
 
     shift_m: Array
     covariance_m2: Array  # (2, 2), a kilometre along a direction without information
+
+    def repeated(self, times: int) -> "Hint":
+        """Return the hint as one that says what so many others have said already.
+
+        However many there are, together they tell less than two: 1 + 1/4 + 1/9 ... = 1.64.
+        """
+        return replace(self, covariance_m2=(1 + times) ** 2 * self.covariance_m2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

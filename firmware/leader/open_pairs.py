@@ -2,6 +2,8 @@
 
 Where relief is faint a match finds several places, and the prior cannot tell them apart. Other
 closures narrow the prior later; then one place is left, and the pair becomes a closure after all.
+Until then it may leave a hint. Neighbouring pairs mistake the same hill for the same other one, so
+what the second and third of them say counts for less.
 """
 
 from collections import Counter, OrderedDict
@@ -17,6 +19,7 @@ from firmware.leader.pairing import Calibrations
 from firmware.leader.pose_graph import PoseGraph
 from protocol.errors import EstimationError
 
+_ALIKE_S = 90.0  # between the middles of sub-maps that see much of the same ground
 _OPEN = (NoMatch.AMBIGUOUS, NoMatch.LOOSE)  # what a narrower prior may decide
 
 
@@ -108,7 +111,12 @@ class OpenPairs:
         return looks
 
     def keep_or_settle(
-        self, job: MatchJob, outcome: MatchOutcome, graph: PoseGraph, judgement: Judgement
+        self,
+        job: MatchJob,
+        outcome: MatchOutcome,
+        atlas: Atlas,
+        graph: PoseGraph,
+        judgement: Judgement,
     ) -> None:
         """Keep a pair open with the first hint that a look left; a match takes the hint's place.
 
@@ -123,9 +131,25 @@ class OpenPairs:
             if hint is not None:
                 judgement.drop_hint(hint, graph)
         elif outcome.hint is not None and hint is None:
-            number = enter_hint(job, outcome.hint, graph, self._settings)
+            told = outcome.hint.repeated(self._alike(job, atlas))
+            number = enter_hint(job, told, graph, self._settings)
             judgement.note_hint(number)
             self.note_hint(*pair, number)
 
+    def _alike(self, job: MatchJob, atlas: Atlas) -> int:
+        """Return how many pairs of neighbours of a job's sub-maps have left hints."""
+        hinted = [
+            (atlas[one], atlas[other])
+            for target, pairs in self._of.items()
+            for origin, pair in pairs.items()
+            if pair.hint is not None and origin in atlas and target in atlas
+            for one, other in ((origin, target), (target, origin))
+        ]
+        return sum(_see_alike(a, job.origin) and _see_alike(b, job.target) for a, b in hinted)
+
     def __len__(self) -> int:
         return len(self._of)
+
+
+def _see_alike(one: Sheet, other: Sheet) -> bool:
+    return one.id.chain == other.id.chain and abs(one.time_s - other.time_s) <= _ALIKE_S

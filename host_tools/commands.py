@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from firmware.follower.settings import FollowerSettings
 from host_tools.mission_settings import MissionSettings, changed
 from host_tools.scenario import load_scenario
 from protocol.errors import ConfigError
@@ -55,8 +56,14 @@ def add_mission_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_settings_arguments(parser)
     parser.add_argument("--seed", type=seed, default=1, metavar="N", help="default: 1")
-    parser.add_argument("--profile", choices=CHOICES, default="paper", help="default: paper")
+    add_profile_argument(parser)
     parser.add_argument("--baseline", choices=BASELINES, default="none", help="default: none")
+
+
+def add_profile_argument(parser: argparse.ArgumentParser) -> None:
+    """Add --profile."""
+    profile = FollowerSettings().profile
+    parser.add_argument("--profile", choices=CHOICES, default=profile, help=f"default: {profile}")
 
 
 def settings_of(arguments: argparse.Namespace) -> MissionSettings:

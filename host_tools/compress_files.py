@@ -9,6 +9,7 @@ from firmware.compression import compress, packets_from
 from firmware.compression.binning import SoundingBins
 from firmware.compression.packing import submap_header
 from firmware.compression.settings import BinningSettings, CompressionSettings
+from firmware.follower.settings import FollowerSettings
 from firmware.geometry import Array
 from firmware.leader.reconstruction import ReconstructionSettings, reconstruct_packets
 from firmware.submaps import Track
@@ -223,8 +224,8 @@ def _configure_compress(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--profile",
         choices=CHOICES,
-        default="paper",
-        help="default: paper; auto: lattice in as few of the frames as do about as well",
+        default=FollowerSettings().profile,
+        help="default: lattice; auto: lattice in as few of the frames as do about as well",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="FRAMES.bin")
     parser.add_argument(

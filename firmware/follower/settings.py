@@ -15,7 +15,7 @@ class FollowerSettings(Settings):
     """Everything that a follower may be told."""
 
     profile: str = setting(
-        "paper",
+        "lattice",
         "",
         "what a sub-map is sent as; `auto` is `lattice` in as few frames as do about as well",
         choices=("paper", "dense", "lattice", "auto"),

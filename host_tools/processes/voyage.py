@@ -6,7 +6,12 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-from host_tools.commands import CHOICES, add_settings_arguments, seed, settings_of
+from host_tools.commands import (
+    add_profile_argument,
+    add_settings_arguments,
+    seed,
+    settings_of,
+)
 from host_tools.mission_settings import MissionSettings
 from host_tools.simulator.placement import Site, place_survey
 from host_tools.simulator.terrain import open_terrain
@@ -62,7 +67,7 @@ def add_voyage_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--terrain", type=Path, metavar="FILE", help="default: a built-in relief")
     add_settings_arguments(parser)
     parser.add_argument("--seed", type=seed, default=1, metavar="N", help="default: 1")
-    parser.add_argument("--profile", choices=CHOICES, default="paper", help="default: paper")
+    add_profile_argument(parser)
 
 
 def _as_given(arguments: argparse.Namespace) -> tuple[str, ...]:

@@ -107,13 +107,13 @@ def test_a_fit_that_cannot_go_on_is_counted(monkeypatch: pytest.MonkeyPatch) -> 
         raise EstimationError("singular")
 
     monkeypatch.setattr("firmware.compression.weights.factorised", refuse)
-    core = follower_of(PATH)
+    core = follower_of(PATH, profile="paper")
     assert sent(core, 60.0)
     assert core.status()["fits_stopped_early"] >= 1
 
 
 def test_paper_profile_in_shared_air_leaves_whole_submaps_out() -> None:
-    core = follower_of(PATH, slots=slots_of(2))
+    core = follower_of(PATH, slots=slots_of(2), profile="paper")
     packets = [p for p in sent(core, 200.0) if isinstance(p, SubmapPacket)]
     whole = {p.header.submap for p in packets}
     assert core.status()["submaps_without_air"] >= 3

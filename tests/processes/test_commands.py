@@ -119,7 +119,8 @@ def test_a_modem_that_is_too_small_for_the_profile_is_told(
     line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("host_tools.processes.vehicle.await_identified", lambda *_: {})
-    assert main(["leader", "--modem", f"nanomodem://{line}", *SHORT]) == 2
+    paper = ["--profile", "paper"]
+    assert main(["leader", "--modem", f"nanomodem://{line}", *SHORT, *paper]) == 2
     error = capsys.readouterr().err
     assert "profile paper has frames of 256 bytes, this modem carries 62; take profile" in error
 

@@ -118,7 +118,8 @@ def test_a_mission_of_small_lattice_frames_on_emulated_nanomodems(tmp_path: Path
 def test_nanomodems_refuse_the_papers_frames_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = ["demo", "--modems", "nanomodem", "--set", "duration_min=1", "--out", str(tmp_path)]
+    run = ["demo", "--modems", "nanomodem", "--profile", "paper", "--set", "duration_min=1"]
+    run += ["--out", str(tmp_path)]
     assert main(run) == 2
     error = capsys.readouterr().err
     assert "profile paper has frames of 256 bytes, this modem carries 62; take profile" in error

@@ -72,7 +72,7 @@ class LoopClosing:
             if outcome.reason is not None:
                 self._counters[f"match_{outcome.reason.name.lower()}"] += 1
             try:
-                self._open.keep_or_settle(job, outcome, self._atlas, self._graph, self._judgement)
+                self._open.keep_or_settle(job, outcome, self._graph, self._judgement)
                 closure = closure_of(job, outcome, self._graph, now_s)
             except EstimationError:
                 self._counters["closures_unplaceable"] += 1

@@ -44,7 +44,7 @@ class MatchJob:
     @property
     def prior_radius_m(self) -> float:
         """That of a circle as large as the ellipse of one sigma in which the offset was sought."""
-        return float(np.linalg.det(self.prior_covariance_m2) ** 0.25)
+        return float(max(np.linalg.det(self.prior_covariance_m2), 0.0) ** 0.25)
 
     def run(self) -> MatchOutcome:
         """Match the pair."""

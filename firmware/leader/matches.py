@@ -161,7 +161,7 @@ class Hint:
     def repeated(self, times: int) -> "Hint":
         """Return the hint as one that says what so many others have said already.
 
-        However many there are, together they tell less than two: 1 + 1/4 + 1/9 ... = 1.64.
+        However many they are, together they tell less than two: 1 + 1/4 + 1/9 ... < 1.65.
         """
         return replace(self, covariance_m2=(1 + times) ** 2 * self.covariance_m2)
 

@@ -6,7 +6,7 @@ Until then it may leave a hint. Neighbouring pairs mistake the same hill for the
 what the second and third of them say counts for less.
 """
 
-from collections import Counter, OrderedDict
+from collections import Counter, OrderedDict, deque
 from dataclasses import dataclass, replace
 
 from firmware.leader.atlas import Atlas, Sheet, SheetId
@@ -19,8 +19,12 @@ from firmware.leader.pairing import Calibrations
 from firmware.leader.pose_graph import PoseGraph
 from protocol.errors import EstimationError
 
+_HEARD = 512  # hints whose neighbours are told from others
 _ALIKE_S = 90.0  # between the middles of sub-maps that see much of the same ground
 _OPEN = (NoMatch.AMBIGUOUS, NoMatch.LOOSE)  # what a narrower prior may decide
+
+Ends = tuple[tuple[int, float], ...]
+"""Chain and time of both sub-maps of a pair."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,6 +35,14 @@ class OpenPair:
     hint: int | None = None
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Heard:
+    """A hint that was entered, and what sub-maps told it."""
+
+    number: int
+    ends: Ends
+
+
 class OpenPairs:
     """Open pairs by the sheet that was matched, bounded by the number of such sheets."""
 
@@ -38,6 +50,7 @@ class OpenPairs:
         self.counters: Counter[str] = Counter()
         self._settings = settings
         self._of: OrderedDict[SheetId, dict[SheetId, OpenPair]] = OrderedDict()
+        self._hints: deque[_Heard] = deque(maxlen=_HEARD)
 
     def note(self, job: MatchJob, outcome: MatchOutcome) -> None:
         """Remember a pair that a match left open, forget one that is none; a closure settles it."""
@@ -114,7 +127,6 @@ class OpenPairs:
         self,
         job: MatchJob,
         outcome: MatchOutcome,
-        atlas: Atlas,
         graph: PoseGraph,
         judgement: Judgement,
     ) -> None:
@@ -131,25 +143,29 @@ class OpenPairs:
             if hint is not None:
                 judgement.drop_hint(hint, graph)
         elif outcome.hint is not None and hint is None:
-            told = outcome.hint.repeated(self._alike(job, atlas))
+            told = outcome.hint.repeated(self._heard((job.origin, job.target), graph))
             number = enter_hint(job, told, graph, self._settings)
             judgement.note_hint(number)
             self.note_hint(*pair, number)
+            if number is not None:
+                ends = tuple((sheet.id.chain, sheet.time_s) for sheet in (job.origin, job.target))
+                self._hints.append(_Heard(number=number, ends=ends))
 
-    def _alike(self, job: MatchJob, atlas: Atlas) -> int:
-        """Return how many pairs of neighbours of a job's sub-maps have left hints."""
-        hinted = [
-            (atlas[one], atlas[other])
-            for target, pairs in self._of.items()
-            for origin, pair in pairs.items()
-            if pair.hint is not None and origin in atlas and target in atlas
-            for one, other in ((origin, target), (target, origin))
-        ]
-        return sum(_see_alike(a, job.origin) and _see_alike(b, job.target) for a, b in hinted)
+    def _heard(self, pair: tuple[Sheet, Sheet], graph: PoseGraph) -> int:
+        """Return how many hints of neighbours of a pair's sub-maps are believed."""
+        ends = tuple((sheet.id.chain, sheet.time_s) for sheet in pair)
+        return sum(
+            graph.is_active(hint.number) or hint.number not in graph  # then it was composed
+            for hint in self._hints
+            if _see_alike(hint.ends, ends) or _see_alike(hint.ends, ends[::-1])
+        )
 
     def __len__(self) -> int:
         return len(self._of)
 
 
-def _see_alike(one: Sheet, other: Sheet) -> bool:
-    return one.id.chain == other.id.chain and abs(one.time_s - other.time_s) <= _ALIKE_S
+def _see_alike(some: Ends, others: Ends) -> bool:
+    return all(
+        one[0] == other[0] and abs(one[1] - other[1]) <= _ALIKE_S
+        for one, other in zip(some, others, strict=True)
+    )

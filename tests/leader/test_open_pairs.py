@@ -235,47 +235,45 @@ def test_no_sheet_has_two_turns_beside_a_new_one(atlas: Atlas, graph: PoseGraph)
     assert pairs.second_looks(third, atlas, graph, calibrations) == []
 
 
-def test_neighbouring_pairs_together_tell_less_than_two(graph: PoseGraph) -> None:
+@pytest.mark.parametrize("outcome", [AMBIGUOUS, UNSETTLED])
+def test_neighbouring_pairs_together_tell_less_than_two(
+    graph: PoseGraph, outcome: MatchOutcome
+) -> None:
     """Hints of one false hill, seen from many sub-maps, do not outvote what is known otherwise."""
     (job,) = _looks(graph, 1e6)
     hint = Hint(shift_m=np.array([7.0, -4.0]), covariance_m2=0.1 * job.prior_covariance_m2)
     pairs = OpenPairs(dataclasses.replace(ClosureSettings(), hint_prior_m=0.0))
     judgement = Judgement(JudgementSettings(), MatchingSettings())
-    atlas, entered_m2 = Atlas(8), []
+    entered_m2 = []
     for k, apart_s in enumerate((0.0, 20.0, 40.0, 100.0)):
         target = dataclasses.replace(
             job.target,
             id=dataclasses.replace(job.target.id, submap=10 + k),
             time_s=job.target.time_s + apart_s,
         )
-        for sheet in (job.origin, target):
-            atlas.add(sheet)
         again = dataclasses.replace(job, target=target)
-        pairs.keep_or_settle(
-            again, dataclasses.replace(AMBIGUOUS, hint=hint), atlas, graph, judgement
-        )
-        number = pairs.hint(job.origin.id, target.id)
-        assert number is not None
-        entered_m2.append(graph.closure(number).covariance_m2)
+        pairs.keep_or_settle(again, dataclasses.replace(outcome, hint=hint), graph, judgement)
+        entered_m2.append(graph.closure(pairs._hints[-1].number).covariance_m2)
+    assert len(pairs._hints) == 4
     lone_m2 = entered_m2[0] - hint.covariance_m2  # of the walk of dead reckoning
     for covariance_m2, said_before in zip(entered_m2, (0, 1, 2, 2), strict=True):
         told_m2 = (1 + said_before) ** 2 * hint.covariance_m2
         assert covariance_m2 - lone_m2 == pytest.approx(told_m2)
 
 
-def test_match_takes_the_place_of_the_hint(atlas: Atlas, graph: PoseGraph) -> None:
+def test_match_takes_the_place_of_the_hint(graph: PoseGraph) -> None:
     (job,) = _looks(graph, 1e6)
     hint = Hint(shift_m=np.array([7.0, -4.0]), covariance_m2=0.1 * job.prior_covariance_m2)
     pairs = OpenPairs(dataclasses.replace(ClosureSettings(), hint_prior_m=0.0))
     judgement = Judgement(JudgementSettings(), MatchingSettings())
-    pairs.keep_or_settle(job, dataclasses.replace(AMBIGUOUS, hint=hint), atlas, graph, judgement)
+    pairs.keep_or_settle(job, dataclasses.replace(AMBIGUOUS, hint=hint), graph, judgement)
     number = pairs.hint(job.origin.id, job.target.id)
     assert graph.is_active(number)
-    pairs.keep_or_settle(job, dataclasses.replace(AMBIGUOUS, hint=hint), atlas, graph, judgement)
+    pairs.keep_or_settle(job, dataclasses.replace(AMBIGUOUS, hint=hint), graph, judgement)
     assert pairs.hint(job.origin.id, job.target.id) == number
     assert judgement.counters["hints_taken"] == 1
     found = MatchOutcome(match=MagicMock(), reason=None)
-    pairs.keep_or_settle(job, found, atlas, graph, judgement)
+    pairs.keep_or_settle(job, found, graph, judgement)
     assert not graph.is_active(number)
     assert len(pairs) == 0
 

@@ -18,6 +18,7 @@ from firmware.geometry import Array
 from protocol.settings import Settings, setting
 
 _WALKS = np.geomspace(1 / 16, 16.0, 9)  # of the believed one, a filter each
+_MOST_TOLD = 5.0  # of walks by one thing seen, in nats
 _BELIEVED = 4  # which of them takes that itself
 
 
@@ -127,6 +128,7 @@ class DriftFilter:
         keep = np.eye(8) - gain @ design
         missed = np.linalg.solve(spread, innovation[..., None])[..., 0]
         log_likely = -0.5 * (np.linalg.slogdet(spread)[1] + (innovation * missed).sum(axis=1))
+        log_likely = np.maximum(log_likely, log_likely.max() - _MOST_TOLD)  # it may be a wrong one
         return DriftState(
             time_s=state.time_s,
             means=state.means + (gain @ innovation[..., None])[..., 0],

@@ -204,16 +204,14 @@ class Reassembler:
         """Return the oldest open transfer of a vehicle and the bitmap of what it still lacks.
 
         Bit i stands for fragment i. Fragments after the last one heard are not asked for while the
-        transfer is the vehicle's newest: they may still be on their way; nor are more of them than
-        it takes to have enough.
+        transfer is the vehicle's newest: they may still be on their way.
         """
         for key, slot in self._slots.items():
             if key[0] != vehicle:
                 continue
             count = slot.first.header.fragment_count
             end = count if slot.overtaken_at_s is not None else max(slot.fragments)
-            lacking = [i for i in range(end) if i not in slot.fragments]
-            bitmap = sum(1 << i for i in lacking[: (slot.enough or count) - len(slot.fragments)])
+            bitmap = sum(1 << i for i in range(end) if i not in slot.fragments)
             if bitmap:
                 return key, bitmap
         return None

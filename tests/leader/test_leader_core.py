@@ -313,4 +313,4 @@ def test_lost_fragments_are_asked_for_and_repeated_where_the_air_has_room() -> N
         > plain.leader.status()["reassembly_complete"]
     )
     sent = [packet for packet, _ in repeated.up]
-    assert len(sent) <= len(plain.up) * 4 / 3  # one for each sub-map, and no more
+    assert len(sent) <= len(plain.up) * 5 / 3  # the two that were lost of each sub-map

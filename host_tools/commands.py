@@ -79,7 +79,8 @@ def settings_of(arguments: argparse.Namespace) -> MissionSettings:
     if arguments.loss is not None:
         changes = {"scenario.water.loss": arguments.loss, **changes}
     if getattr(arguments, "profile", None) is not None:
-        changes = {"follower.profile": arguments.profile, **changes}
+        is_octree = getattr(arguments, "baseline", None) == "octree"  # rides in paper's packets
+        changes = {"follower.profile": "paper" if is_octree else arguments.profile, **changes}
     settings = changed(settings, changes)
     settings.scenario.check()
     return settings

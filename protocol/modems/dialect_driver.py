@@ -290,5 +290,6 @@ def check_frame_size(modem_bytes: int, frame_bytes: int, name: str) -> None:
     if frame_bytes > modem_bytes:
         raise ConfigError(
             f"profile {name} has frames of {frame_bytes} bytes, this modem carries {modem_bytes};"
-            " take profile lattice in its 62-byte size, or a Micro-Modem at rate 3, 4 or 5"
+            " take profile lattice in its 62-byte size"
+            " (follower.compression.small_frames=true), or a Micro-Modem at rate 3, 4 or 5"
         )

@@ -143,17 +143,16 @@ class OpenPairs:
             if hint is not None:
                 judgement.drop_hint(hint, graph)
         elif outcome.hint is not None and hint is None:
-            told = outcome.hint.repeated(self._heard((job.origin, job.target), graph))
+            ends = _ends_of(job)
+            told = outcome.hint.repeated(self._heard(ends, graph))
             number = enter_hint(job, told, graph, self._settings)
             judgement.note_hint(number)
             self.note_hint(*pair, number)
             if number is not None:
-                ends = tuple((sheet.id.chain, sheet.time_s) for sheet in (job.origin, job.target))
                 self._hints.append(_Heard(number=number, ends=ends))
 
-    def _heard(self, pair: tuple[Sheet, Sheet], graph: PoseGraph) -> int:
+    def _heard(self, ends: Ends, graph: PoseGraph) -> int:
         """Return how many hints of neighbours of a pair's sub-maps are believed."""
-        ends = tuple((sheet.id.chain, sheet.time_s) for sheet in pair)
         return sum(
             graph.is_active(hint.number) or hint.number not in graph  # then it was composed
             for hint in self._hints
@@ -162,6 +161,10 @@ class OpenPairs:
 
     def __len__(self) -> int:
         return len(self._of)
+
+
+def _ends_of(job: MatchJob) -> Ends:
+    return tuple((sheet.id.chain, sheet.time_s) for sheet in (job.origin, job.target))
 
 
 def _see_alike(some: Ends, others: Ends) -> bool:

@@ -1,12 +1,16 @@
+import argparse
+
 import numpy as np
 import pytest
 
 from firmware.follower.core import FollowerCore
 from firmware.follower.settings import FollowerSettings
 from host_tools.baselines import Originals, copied_steps, octree, unlimited
+from host_tools.commands import add_mission_arguments, settings_of
 from host_tools.mission import deployed
 from host_tools.octree import octree_submap
 from host_tools.scenario import named_scenario
+from host_tools.simulate import simulate
 from host_tools.simulator.placement import place_survey
 from host_tools.simulator.terrain import open_terrain
 from host_tools.simulator.vehicle import SimulatedVehicle
@@ -68,3 +72,14 @@ def test_octree_is_lost_with_any_of_its_packets_and_only_with_those(originals: O
     for missing in range(chunks):
         with pytest.raises(EstimationError, match="lost"):
             rebuild(transfer(0, set(range(10)) - {missing}))
+
+
+def test_octrees_travel_whole_whatever_the_default_profile_needs() -> None:
+    parser = argparse.ArgumentParser()
+    add_mission_arguments(parser)
+    short = ["--set", "duration_min=3", "--set", "follower_duration_min=3", "--loss", "0"]
+    arguments = parser.parse_args(["--baseline", "octree", *short])
+    result = simulate(settings_of(arguments), None, arguments.seed, arguments.baseline)
+    status = result.counters["leader"]
+    assert status["reassembly_complete"] >= 2
+    assert status.get("submaps_not_rebuilt", 0) == 0

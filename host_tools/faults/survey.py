@@ -17,9 +17,6 @@ CHEAP = {
     "follower_duration_min": 20.0,
     "leg_m": 100.0,
     "beams": 24,
-    "follower.compression.iterations": 2,
-    "follower.compression.max_fit_rows": 256,
-    "follower.compression.fit_cell_m": 8.0,
     "follower.compression.sealed": True,
     "leader.reconstruction.sealed": True,
     "leader.closures.pairs_per_submap": 1,
@@ -28,7 +25,7 @@ CHEAP = {
     "leader.answers": "extended",
     "leader.hop_s": 40.0,
 }
-"""What is fitted and matched little says as much about faults as what is fitted well."""
+"""What is matched little says as much about faults as what is matched well."""
 
 
 class Survey:

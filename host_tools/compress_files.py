@@ -220,12 +220,13 @@ def _write(path: Path, data: bytes) -> None:
 
 
 def _configure_compress(parser: argparse.ArgumentParser) -> None:
+    profile = FollowerSettings().profile
     parser.add_argument("soundings", type=Path, metavar="SOUNDINGS.npz")
     parser.add_argument(
         "--profile",
         choices=CHOICES,
-        default=FollowerSettings().profile,
-        help="default: lattice; auto: lattice in as few of the frames as do about as well",
+        default=profile,
+        help=f"default: {profile}; auto: lattice in as few of the frames as do about as well",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="FRAMES.bin")
     parser.add_argument(

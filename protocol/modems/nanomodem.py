@@ -138,7 +138,7 @@ class Nanomodem:
         if not 0 < len(frame) <= FRAME_BYTES:
             raise LocalProtocolError(
                 f"{len(frame)} bytes: a Nanomodem carries frames of 1 to {FRAME_BYTES}, so no"
-                " profile of 256-byte frames fits; take profile lattice in its 62-byte size"
+                " profile of 256-byte frames, as paper is, fits; take lattice in its 62-byte size"
                 " (follower.compression.small_frames=true), or a Micro-Modem at rate 3, 4 or 5"
             )
         self.outbox.put(frame, now_s if start_s is None else start_s)

@@ -290,24 +290,31 @@ def _longest_step_ms(bins: BinnedSoundings, profile: str) -> float:
         longest_s = max(longest_s, time.process_time() - started_s)
 
 
-def anytime(chosen: list[Window]) -> list[float]:
-    """Print and return RMSE at a quarter of the default budget against ten times the budget."""
-    ratios = []
-    for window in chosen:
-        errors = []
-        full = CompressionSettings()
-        for iterations in (full.iterations // 4, full.iterations, 10 * full.iterations):
-            settings = CompressionSettings(iterations=iterations)
-            coded = ours("paper", settings)(window)
-            errors.append(rmse_m(coded, window, 0.0, 10)[0])
-        ratios.append(errors[0] / errors[1])
-        ratios.append(errors[1] / errors[2])
-    quarter, whole = ratios[0::2], ratios[1::2]
-    print(
-        f"\nAnytime, paper: a quarter of the budget {np.median(quarter):.3f} x the whole "
-        f"({max(quarter):.3f}); the whole {np.median(whole):.3f} x ten times it ({max(whole):.3f})"
-    )
-    return ratios
+def anytime(chosen: list[Window]) -> dict[str, list[list[float]]]:
+    """Print and return RMSE after a quarter of the budget, all of it and ten times it, in m.
+
+    By profile, a row a window.
+    """
+    full = CompressionSettings()
+    out: dict[str, list[list[float]]] = {}
+    for profile, budget in (("paper", full.iterations), ("dense", full.dense_iterations)):
+        coders = [
+            ours(profile, CompressionSettings(iterations=n, dense_iterations=n))
+            for n in (budget // 4, budget, 10 * budget)
+        ]
+        out[profile] = [
+            [rmse_m(code(window), window, 0.0, 10)[0] for code in coders] for window in chosen
+        ]
+        quarter, whole, tenfold = np.array(out[profile]).T
+        print(
+            f"Anytime, {profile}: a quarter of the budget {_ratios(quarter / whole)} x the whole; "
+            f"the whole {_ratios(whole / tenfold)} x ten times it"
+        )
+    return out
+
+
+def _ratios(values: Array) -> str:
+    return f"{np.median(values):.3f} ({values.max():.3f})"
 
 
 def memory() -> dict[str, float]:

@@ -48,7 +48,7 @@ class CompositionSettings(Settings):
         minimum=1200.0,
     )
     levels: int = setting(
-        3, "", "pieces of 1, 4 and 16 minutes: nodes grow with the logarithm of time", minimum=1
+        4, "", "pieces of 1 to 64 minutes: nodes grow with the logarithm of time", minimum=1
     )
     closures_per_piece: int = setting(
         2, "closures", "with older pieces; more say the same again", minimum=1

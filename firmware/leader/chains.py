@@ -36,10 +36,15 @@ class Chain:
 
     def nearest(self, time_s: float) -> int:
         """Return the index of the node nearest to a time, the earlier of two."""
-        after = bisect.bisect_left(self.times_s, time_s)
-        if after in (0, len(self.times_s)):
-            return max(after - 1, 0)
-        return after - (time_s - self.times_s[after - 1] <= self.times_s[after] - time_s)
+        return _nearest(self.times_s, time_s)
+
+    def in_shape_s(self, time_s: float) -> float:
+        """Return the time nearest to a time at which there was a node when the shape was kept."""
+        assert self.shape is not None
+        times_s = self.shape.time_s
+        after = int(np.searchsorted(times_s, time_s))
+        near_s = times_s[max(after - 1, 0) : after + 1]
+        return float(near_s[np.argmin(np.abs(near_s - time_s))])
 
     def trajectory(self, states: Array) -> Trajectory:
         """Return the estimate at all nodes ever, from the states (K, 4) of those that are left."""
@@ -52,18 +57,22 @@ class Chain:
         )
         return whole if self.shape is None else self.shape.carried_by(whole)
 
-    def drop(self, kept: NDArray[np.bool_], trajectory: Trajectory) -> dict[int, int]:
-        """Leave some nodes (K,) only; return to which of them each dropped one is nearest."""
-        gone = [key for key, stays in zip(self.keys, kept, strict=True) if not stays]
-        gone_s = [time_s for time_s, stays in zip(self.times_s, kept, strict=True) if not stays]
+    def owners(self, kept: NDArray[np.bool_]) -> dict[int, int]:
+        """Return the key of each node that is not kept (K,), and of the kept one nearest to it."""
+        stay = np.flatnonzero(kept)
+        stay_s = [self.times_s[k] for k in stay]
+        return {
+            self.keys[k]: self.keys[stay[_nearest(stay_s, self.times_s[k])]]
+            for k in np.flatnonzero(~kept)
+        }
+
+    def drop(self, kept: NDArray[np.bool_], trajectory: Trajectory) -> None:
+        """Leave some nodes (K,) only; what lies between keeps the shape of the trajectory."""
         stay = np.flatnonzero(kept)
         self.times_s = [self.times_s[k] for k in stay]
         self.reckoned_m = [self.reckoned_m[k] for k in stay]
         self.keys = [self.keys[k] for k in stay]
         self.shape = trajectory
-        return {
-            key: self.keys[self.nearest(time_s)] for key, time_s in zip(gone, gone_s, strict=True)
-        }
 
     def odometry(
         self, before: int, after: int, odometry_noise: float, bias_walk: float
@@ -80,6 +89,13 @@ class Chain:
             position_sigma_m=float(np.sqrt(variance_m2)),
             bias_sigma_mps=float(bias_walk * np.sqrt(interval_s)),
         )
+
+
+def _nearest(times_s: list[float], time_s: float) -> int:
+    after = bisect.bisect_left(times_s, time_s)
+    if after in (0, len(times_s)):
+        return max(after - 1, 0)
+    return after - (time_s - times_s[after - 1] <= times_s[after] - time_s)
 
 
 def shared_walk(

@@ -1,13 +1,13 @@
 """The old part of the pose graph made coarse, so that its size hardly grows with the mission.
 
 Beyond the window of detail a chain keeps one node a piece. What lies between is frozen in the shape
-that it was last estimated in, and moves with the nodes around it; dead reckoning, ranges and
+that it was last estimated in, and moves with the nodes around it; dead reckoning, fixes, ranges and
 closures of a piece are composed. A piece keeps its closures with the oldest pieces, which the start
 holds best: so the past hangs on a fixed map rather than on all of itself.
 """
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -63,7 +63,8 @@ class CompositionSettings(Settings):
 
 _COARSER = 4  # from level to level, pieces and the age at which they begin alike
 Link = TypeVar("Link", ClosureRecord, RangeRecord)
-Group = list[tuple[int, Entry, Link]]  # of one pair of pieces: number, entry as it was, as moved
+Kept = TypeVar("Kept", ClosureRecord, RangeRecord, AbsoluteRecord)
+Group = list[tuple[int, Entry, Kept]]  # of a piece or two: number, entry as it was, as moved
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -134,6 +135,7 @@ class Composition:
         kept: dict[int, Entry] = {}
         closures: dict[tuple[int, int], Group[ClosureRecord]] = defaultdict(list)
         ranges: dict[tuple[int, int], Group[RangeRecord]] = defaultdict(list)
+        fixes: dict[int, Group[AbsoluteRecord]] = defaultdict(list)
         for number, entry in ledger.items():
             match entry.record:
                 case ClosureRecord() as closure:
@@ -153,10 +155,15 @@ class Composition:
                     if anchor.key in self._owners:
                         spread_m2 = fix.covariance_m2 + self._apart_m2[anchor.key]
                         record = replace(record, covariance_m2=spread_m2)
+                    if record.anchor.key in self._old:
+                        fixes[record.anchor.key].append((number, entry, record))
+                        continue
                     kept[number] = Entry(record=record, active=entry.active)
                 case PriorRecord() | SharedDriftRecord() as record:
                     kept[number] = Entry(record=record, active=entry.active)
         new: list[Record] = []
+        for fix_group in fixes.values():
+            _keep(fix_group, self._one_fix, kept, new)
         for range_group in ranges.values():
             _keep(range_group, self._one_range, kept, new)
         for closure_group in self._thinned(closures):
@@ -222,17 +229,29 @@ class Composition:
 
     def _one_closure(self, records: list[ClosureRecord]) -> ClosureRecord:
         """Return their weighted mean, as uncertain as one of them: neighbours err alike."""
+        moved_m, covariance_m2 = self._mean(records)
+        return replace(
+            records[0],
+            offset_m=records[0].offset_m + moved_m,
+            covariance_m2=covariance_m2,
+        )
+
+    def _one_fix(self, records: list[AbsoluteRecord]) -> AbsoluteRecord:
+        """Return their weighted mean, as uncertain as one of them: they share the way and a sky."""
+        moved_m, covariance_m2 = self._mean(records)
+        return replace(
+            records[0], position_m=records[0].position_m + moved_m, covariance_m2=covariance_m2
+        )
+
+    def _mean(self, records: Sequence[ClosureRecord | AbsoluteRecord]) -> tuple[Array, Array]:
+        """Return how far the first must move to say what all say, and the covariance of one."""
         weights = [np.linalg.inv(record.covariance_m2) for record in records]
         covariance_m2 = np.linalg.inv(np.sum(weights, axis=0))
         innovations_m = [record.innovation_m(self._estimate.__getitem__) for record in records]
         mean_m = covariance_m2 @ np.sum(
             [w @ i for w, i in zip(weights, innovations_m, strict=True)], axis=0
         )
-        return replace(
-            records[0],
-            offset_m=records[0].offset_m + innovations_m[0] - mean_m,
-            covariance_m2=len(records) * covariance_m2,
-        )
+        return innovations_m[0] - mean_m, len(records) * covariance_m2
 
     def _one_range(self, records: list[RangeRecord]) -> RangeRecord:
         """Return the one in the middle with the weighted mean of all innovations."""
@@ -249,12 +268,12 @@ class Composition:
 
 
 def _keep(
-    group: Group[Link],
-    composed: Callable[[list[Link]], Link],
+    group: Group[Kept],
+    composed: Callable[[list[Kept]], Kept],
     kept: dict[int, Entry],
     new: list[Record],
 ) -> None:
-    """Let one record of a pair of pieces stay as it is; several become a new one."""
+    """Let one record of a piece, or of two, stay as it is; several become a new one."""
     active = [item for item in group if item[1].active]
     if len(active) == 1:
         number, _, record = active[0]

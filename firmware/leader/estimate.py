@@ -82,13 +82,15 @@ class Estimate:
         chain = self._chains[vehicle]
         nearest = chain.nearest(time_s)
         key, lag_s = chain.keys[nearest], time_s - chain.times_s[nearest]
-        if chain.shape is not None and time_s < chain.shape.time_s[-1]:
-            return self._anchor_in_shape(vehicle, key, time_s, track)
-        if abs(lag_s) > 2 * self._settings.node_interval_s:
+        in_shape = chain.shape is not None and time_s < chain.shape.time_s[-1]
+        known_s = chain.in_shape_s(time_s) if in_shape else chain.times_s[nearest]
+        if abs(time_s - known_s) > 2 * self._settings.node_interval_s:
             raise EstimationError(
-                f"vehicle {vehicle} has no node near {time_s:.1f} s; the nearest is at "
-                f"{chain.times_s[nearest]:.1f} s"
+                f"vehicle {vehicle} has no node near {time_s:.1f} s; the nearest is at"
+                f" {known_s:.1f} s"
             )
+        if in_shape:
+            return self._anchor_in_shape(vehicle, key, time_s, track)
         return Anchor(
             key=key,
             parameters=chain.parameters,

@@ -178,17 +178,24 @@ class PoseGraph(Estimate):
         self._learn_walk(now_s)
         estimate = self._states()
         pinned, detail_s = pinned_keys(self._ledger.values()), detail_from_s(now_s, settings)
+        kept = {
+            vehicle: kept_nodes(chain, now_s, pinned, settings)
+            for vehicle, chain in self._chains.items()
+        }
         owners: dict[int, int] = {}
         for vehicle, chain in self._chains.items():
-            kept = kept_nodes(chain, now_s, pinned, settings)
-            owners |= chain.drop(kept, self.trajectory(vehicle).until(detail_s))
+            owners |= chain.owners(kept[vehicle])
+        apart_m2 = self.apart_m2(owners)
+        shapes = {vehicle: self.trajectory(vehicle).until(detail_s) for vehicle in self._chains}
+        for vehicle, chain in self._chains.items():
+            chain.drop(kept[vehicle], shapes[vehicle])
         old = {
             key
             for chain in self._chains.values()
             for key, time_s in zip(chain.keys, chain.times_s, strict=True)
             if time_s < detail_s
         }
-        composition = Composition(owners, self.apart_m2(owners), old, estimate, settings)
+        composition = Composition(owners, apart_m2, old, estimate, settings)
         coarse = composition.coarse(self._ledger)
         self._ledger.clear()
         self._ledger.update(coarse.kept)

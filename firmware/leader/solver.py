@@ -87,7 +87,9 @@ class Solver:
                 self._rebuild(self._values)
         except RuntimeError:
             self._factorization = "QR"
-            self._values.insert(self._fresh)
+            for key in self._fresh.keys():
+                if not self._values.exists(key):
+                    self._values.insert(key, self._fresh.atVector(key))
             self._rebuild(self._values)
             self.rebuilds += 1
         self._fresh = gtsam.Values()

@@ -12,6 +12,7 @@ from firmware.leader.chains import Chain
 from firmware.leader.composition import CompositionSettings, kept_nodes
 from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.ledger import (
+    AbsoluteRecord,
     ClosureRecord,
     OdometryRecord,
     RangeRecord,
@@ -20,6 +21,7 @@ from firmware.leader.ledger import (
 )
 from firmware.leader.pose_graph import PoseGraph
 from firmware.submaps import Track
+from protocol.errors import EstimationError
 
 HOURS, LAP_S = 1.5, 400
 SETTINGS = CompositionSettings()
@@ -192,6 +194,45 @@ def test_anchor_in_the_composed_past_lies_on_the_estimated_track() -> None:
         assert np.hypot(*anchor.offset_m) > 5.0
         lies_m = voyage.graph.trajectory(0).correct(time_s, track.position_at(time_s))
         assert voyage.graph.position(anchor) == pytest.approx(lies_m, abs=1e-6)
+
+
+def test_fixes_of_a_piece_become_one_no_surer_than_each() -> None:
+    voyage = Voyage(None, 3600)
+    track, true_m = voyage.tracks[0]
+    voyage.graph.extend(0, track)
+    for time_s in range(0, 1200, 10):
+        anchor = voyage.graph.anchor(0, float(time_s), track)
+        voyage.graph.add_absolute(anchor, true_m[time_s], 9.0 * np.eye(2))
+    voyage.graph.compose(3600.0, SETTINGS)
+    fixes = [entry.record for entry in voyage.graph._ledger.values()]
+    left = [record for record in fixes if isinstance(record, AbsoluteRecord)]
+    assert len(left) <= 1200 / SETTINGS.piece_s + 1
+    assert all(record.covariance_m2[0, 0] >= 9.0 for record in left)
+    assert np.median(voyage.misses_m(0)[:1200]) < 3.0
+
+
+def test_time_before_a_chain_has_no_anchor_in_the_composed_past() -> None:
+    voyage = Voyage(SETTINGS, 3600).run(0, 3600)
+    track, _ = voyage.tracks[0]
+    with pytest.raises(EstimationError, match="no node near"):
+        voyage.graph.anchor(0, -500.0, track)
+
+
+def test_composition_that_fails_leaves_the_graph_as_it_was(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    voyage = Voyage(None, 3600).run(0, 3000)
+
+    def fails(*_: object) -> dict[int, Array]:
+        raise EstimationError("singular")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(voyage.graph, "apart_m2", fails)
+        with pytest.raises(EstimationError):
+            voyage.graph.compose(3000.0, SETTINGS)
+    voyage.run(3000, 3600)
+    voyage.graph.compose(3600.0, SETTINGS)
+    assert np.mean(voyage.misses_m(0)) < 3.0
 
 
 def test_closure_beyond_its_sigmas_is_not_taken_along() -> None:

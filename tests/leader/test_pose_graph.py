@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from firmware.leader import solver
 from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.ledger import (
     Anchor,
@@ -123,6 +124,26 @@ def test_long_chain_without_closures_stays_solvable() -> None:
     graph.update()
     assert graph.rebuilds <= 1  # once, when Cholesky gives the chain up
     assert graph.trajectory(0).position_m[-1] == pytest.approx([2 * time_s[-1], 0.0], abs=1e-3)
+
+
+def test_graph_outlives_a_rebuild_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    track, _ = walk(np.random.default_rng(4), 400, 0.3)
+    graph = started(track)
+    rebuild, failures = graph._solver._rebuild, [RuntimeError("indeterminate")]
+
+    def fails_once(values: object) -> None:
+        if failures:
+            raise failures.pop()
+        rebuild(values)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(graph._solver, "_rebuild", fails_once)
+    monkeypatch.setattr(solver, "_WORN", 0.0)  # so that every update builds anew
+    graph.extend(0, track)
+    graph.update()
+    assert graph.rebuilds == 1
+    monkeypatch.undo()
+    graph.update()
+    assert graph.trajectory(0).time_s[-1] == 400.0
 
 
 def test_gap_in_a_track_is_bridged_by_composed_positions() -> None:

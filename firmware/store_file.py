@@ -97,6 +97,10 @@ class StoreFile:
         """Put something on the shelf; raise sqlite3.Error if it cannot be."""
         self._database.execute("REPLACE INTO shelf VALUES (?, ?)", (name, body))
 
+    def drop(self, name: str) -> None:
+        """Take something off the shelf; raise sqlite3.Error if it cannot be."""
+        self._database.execute("DELETE FROM shelf WHERE name = ?", (name,))
+
     def get(self, name: str) -> bytes | None:
         """Return what is on the shelf under a name, or None."""
         row = self._one("SELECT body FROM shelf WHERE name = ?", name)

@@ -144,17 +144,24 @@ class Atlas:
 
     def add(self, sheet: Sheet) -> None:
         """Keep a sheet; a better version of a known one takes its place."""
-        self._shelved.pop(sheet.id, None)
+        if sheet.id in self._shelved:
+            self._unshelve(sheet.id)
         self._sheets[sheet.id] = sheet
         if len(self._sheets) + len(self._shelved) > self._capacity:
-            oldest = self._shelved or self._sheets
-            oldest.popitem(last=False)
             self.dropped += 1
+            if self._shelved:
+                self._unshelve(next(iter(self._shelved)))
+            else:
+                self._sheets.popitem(last=False)
 
     def shelve(self, sheet_id: SheetId) -> None:
         """Put a sheet away: it is matched no more, but stays part of the map."""
         self.shelf.put(_name(sheet_id), packed(self._sheets.pop(sheet_id).grid))
         self._shelved[sheet_id] = None
+
+    def _unshelve(self, sheet_id: SheetId) -> None:
+        del self._shelved[sheet_id]
+        self.shelf.drop(_name(sheet_id))
 
     def grids(self) -> Iterator[tuple[int, GriddedSubmap]]:
         """Yield vehicle and grid of every sheet that can be had, those of the shelf first."""

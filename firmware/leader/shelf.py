@@ -19,6 +19,9 @@ class Shelf(Protocol):
     def get(self, name: str) -> bytes | None:
         """Return a body, or None if it is lost."""
 
+    def drop(self, name: str) -> None:
+        """Keep a body no longer, if there is one."""
+
 
 class MemoryShelf:
     """A shelf without a disk: about eight kilobytes a sub-map."""
@@ -33,6 +36,10 @@ class MemoryShelf:
     def get(self, name: str) -> bytes | None:
         """Return a body."""
         return self._bodies.get(name)
+
+    def drop(self, name: str) -> None:
+        """Keep a body no longer."""
+        self._bodies.pop(name, None)
 
 
 def packed(grid: GriddedSubmap) -> bytes:

@@ -46,7 +46,9 @@ class VehicleFiles:
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self._path("starts")
         starts = int(path.read_text(encoding="ascii")) if path.exists() else 0
-        path.write_text(str(starts + 1), encoding="ascii")
+        whole = self._path("starts.new")
+        whole.write_text(str(starts + 1), encoding="ascii")
+        whole.replace(path)  # at once: a kill or a full disk leaves the old count
         return starts
 
     def forget(self) -> None:

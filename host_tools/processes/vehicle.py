@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import datetime
 import itertools
+import logging
 import math
 import sys
 import time
@@ -49,6 +50,7 @@ from protocol.modems.registry import open_modem
 from protocol.modems.sealed import SealedLink, SealedModem
 from protocol.packets import FRAME_BYTES, SMALL_FRAME_BYTES
 
+LOG = logging.getLogger(__name__)
 LEADER = 0
 STATUS_S = 60.0
 WALL = "wall"
@@ -96,10 +98,13 @@ def run_vehicle(
         check_frame_size(modem.largest_frame_bytes, frame_bytes, profile)
         ticks = clock.ticks(voyage.tick_s)
         first_s = next(ticks, None)
-        if first_s is None:
-            return
+        if first_s is None:  # it was killed after its last instant: the store has the mission
+            first_s = voyage.settings.scenario.duration_s + voyage.tick_s
+            sailed: Iterator[float] = iter(())
+        else:
+            sailed = itertools.chain([first_s], ticks)
         aboard = _board(vehicle, starts, modem, clock, sealed, files, first_s, store)
-        _sail(aboard, itertools.chain([first_s], ticks), on_wall=isinstance(clock, WallClock))
+        _sail(aboard, sailed, on_wall=isinstance(clock, WallClock))
         aboard.worker.close()
         if isinstance(aboard.loop.core, Journaled):
             aboard.loop.core.recorder.journal.close()
@@ -119,20 +124,28 @@ def _sail(aboard: Aboard, ticks: Iterator[float], *, on_wall: bool) -> None:
             aboard.loop.step(now_s)
             if now_s != math.floor(now_s):
                 continue
-            core = aboard.loop.core
-            if aboard.files is not None:
-                aboard.files.note(core.belief(), core.reckoned)
-            if now_s % STATUS_S != 0.0:
-                continue
-            if aboard.files is not None:
-                aboard.files.write_counters(aboard.loop.status())
-            if on_wall:
-                print(_status_line(now_s, aboard.loop.status()), file=sys.stderr)
-            for line in advice_lines(aboard.loop.status()):
-                print(line, file=sys.stderr)
+            try:
+                _report(aboard, now_s, on_wall=on_wall)
+            except Exception:  # a full disk, say: the vehicle sails on without its report
+                LOG.exception("no report at %g s", now_s)
     except KeyboardInterrupt:
         if not on_wall:
             raise
+
+
+def _report(aboard: Aboard, now_s: float, *, on_wall: bool) -> None:
+    """Write down a second's belief, and now and then what the counters say."""
+    core = aboard.loop.core
+    if aboard.files is not None:
+        aboard.files.note(core.belief(), core.reckoned)
+    if now_s % STATUS_S != 0.0:
+        return
+    if aboard.files is not None:
+        aboard.files.write_counters(aboard.loop.status())
+    if on_wall:
+        print(_status_line(now_s, aboard.loop.status()), file=sys.stderr)
+    for line in advice_lines(aboard.loop.status()):
+        print(line, file=sys.stderr)
 
 
 def _board(

@@ -64,6 +64,16 @@ class Slots:
             return self.next_leader_slot_s(now_s)
         return self.next_follower_slot_s(now_s, vehicle)
 
+    def is_between(self, vehicle: int, next_slot_s: float, now_s: float) -> bool:
+        """Return whether a vehicle's next slot, told before, has yet to come.
+
+        One that lies farther ahead than slots lie apart was told before the clock was set back.
+        """
+        settings = self.settings
+        turn_s = settings.follower_slot_s * settings.followers
+        apart_s = settings.leader_period_s if vehicle == 0 else turn_s
+        return CLOCK_TOLERANCE_S < next_slot_s - now_s <= apart_s + CLOCK_TOLERANCE_S
+
     def frames_per_submap(self, submap_s: float) -> int:
         """Return how many frames one follower may send while a sub-map is measured."""
         settings = self.settings

@@ -33,7 +33,6 @@ from protocol.timestamps import from_quarters, to_quarters, transmission_s
 
 _IDLE_STATES = 20  # as many as a trajectory packet holds
 _LONGEST_AIRTIME_S = 5.0
-_SUPERFRAME_S = 60.0  # a slot that lies farther ahead was computed before the clock was set back
 
 
 @dataclass(slots=True)
@@ -129,7 +128,7 @@ class FollowerCore:
 
     def poll(self, now_s: float) -> bytes | None:
         """Return a frame to transmit now, or None; as many a slot as it holds, one each call."""
-        if self._next_slot_s - _SUPERFRAME_S < now_s < self._next_slot_s - 1e-6:
+        if self._slots.is_between(self.vehicle, self._next_slot_s, now_s):
             return None
         slot_s = self._slots.next_slot_s(self.vehicle, now_s)
         on_time = abs(slot_s - now_s) < 1e-6

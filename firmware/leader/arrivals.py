@@ -118,10 +118,10 @@ class Arrivals:
     def _receive_states(
         self, header: Header, first_s: float, states: np.ndarray, now_s: float
     ) -> None:
-        last_s = self._fleet.receive_states(header, first_s, states, now_s)
-        if last_s is None:
+        last = self._fleet.receive_states(header, first_s, states, now_s)
+        if last is None:
             return
-        chain = self._fleet.chain(header)
+        chain, last_s = last
         self._answers.note(header, chain, last_s)
         if last_s >= self._ranges_used_s.get(chain, -np.inf) + _RANGE_WINDOW_S:
             self._ranges_used_s[chain] = last_s

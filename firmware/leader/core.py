@@ -41,7 +41,7 @@ from protocol.packets import SealedFrame, SubmapFragment, SubmapPacket, Trajecto
 from protocol.reassembly import Reassembler
 from protocol.schedule import Slots
 
-_SUPERFRAME_S = 60.0  # a slot that lies farther ahead was computed before the clock was set back
+_AHEAD_S = 1.0  # of our clock: no frame has arrived that much later than now
 
 
 class LeaderCore:
@@ -72,6 +72,7 @@ class LeaderCore:
         )
         hops = max(1, round(settings.submaps.duration_s / settings.hop_s))
         self._stretches: deque[Submap] = deque(maxlen=hops)
+        self._tracked_s = -math.inf  # the newest state of the own track
         self._reassembler = Reassembler(patient_reassembly(settings, slots))
         self._ranging = Ranging(settings.ranges)
         self.fleet = Fleet(self.graph, self._ranging, settings.fleet)
@@ -105,7 +106,8 @@ class LeaderCore:
         if odometry.fix is not None:
             self._fixes.hold(odometry.time_s, odometry.fix)
         track = self.fleet.own
-        if not len(track) or state.time_s == math.floor(state.time_s):
+        if state.time_s - self._tracked_s >= 1.0 - 1e-6:
+            self._tracked_s = state.time_s
             track.add(state.time_s, state.north_m, state.east_m, state.yaw_rad)
         submap = self._builder.take()
         if submap is not None:
@@ -133,7 +135,9 @@ class LeaderCore:
             self.counters["frames_of_unknown_vehicles"] += 1
             return
         self.counters["frames_received"] += 1
-        if toa_s is not None:
+        if toa_s is not None and not -math.inf < toa_s <= now_s + _AHEAD_S:
+            self.counters["arrivals_impossible"] += 1
+        elif toa_s is not None:
             depth_m = self._reckoning.state.depth_m
             self._ranging.hold(self.fleet.chain(header), header, toa_s, depth_m)
         self._arrivals.receive(packet, now_s)
@@ -150,6 +154,11 @@ class LeaderCore:
             self.composed_s = now_s
             self._compose(now_s)
 
+    @property
+    def has_jobs(self) -> bool:
+        """Whether a sheet waits for its matches."""
+        return self._closing.has_jobs
+
     def next_jobs(self) -> SheetJobs | None:
         """Return the matches of the oldest sheet that still waits for them, or None."""
         return self._closing.next_jobs()
@@ -162,7 +171,7 @@ class LeaderCore:
 
     def poll(self, now_s: float) -> bytes | None:
         """Return the answer to transmit now, or None; followers take turns."""
-        if self._next_slot_s - _SUPERFRAME_S < now_s < self._next_slot_s - 1e-6:
+        if self._slots.is_between(LEADER, self._next_slot_s, now_s):
             return None
         slot_s = self._slots.next_slot_s(LEADER, now_s)
         self._next_slot_s = self._slots.next_slot_s(LEADER, now_s + 1e-3)
@@ -253,6 +262,8 @@ class LeaderCore:
     def _add_own(self, stretch: Submap) -> None:
         """Join the newest stretches to a sub-map, so that one ends every hop."""
         self.graph.extend(LEADER, self.fleet.own.track())
+        if self._stretches and _is_torn(self._stretches[-1], stretch, self._settings.hop_s):
+            self._stretches.clear()
         self._stretches.append(stretch)
         submap = joined(list(self._stretches))
         if submap.bins.depth_m.size < self._settings.submaps.minimum_cells:
@@ -268,3 +279,8 @@ class LeaderCore:
             return
         self.atlas.add(sheet)
         self._closing.add(sheet)
+
+
+def _is_torn(before: Submap, after: Submap, hop_s: float) -> bool:
+    """Return whether navigation was away between two stretches: what lies between is not known."""
+    return bool(after.track.time_s[0] - before.track.time_s[-1] > hop_s)

@@ -90,9 +90,12 @@ class Fleet:
 
     def receive_states(
         self, header: Header, first_s: float, states: NDArray[np.floating], now_s: float
-    ) -> float | None:
-        """Keep the states (T, 3), one a second from first_s; return the time of the last kept."""
-        s, last_s = self._settings, None
+    ) -> tuple[int, float] | None:
+        """Keep the states (T, 3), one a second from first_s.
+
+        Return the chain and the time of the last one that was kept, or None.
+        """
+        s, last = self._settings, None
         for k in np.flatnonzero(usable_states(states)):
             time_s = first_s + float(k)
             north_m, east_m, yaw_rad = (float(value) for value in states[k])
@@ -100,11 +103,11 @@ class Fleet:
                 self.counters["states_from_the_future"] += 1
             elif time_s < now_s - s.oldest_state_s:
                 self.counters["states_too_old"] += 1
-            elif self._place(header, time_s, north_m, east_m, yaw_rad):
-                last_s = time_s
+            elif (chain := self._place(header, time_s, north_m, east_m, yaw_rad)) is not None:
+                last = chain, time_s
             else:
                 self.counters["states_that_jump"] += 1
-        return last_s
+        return last
 
     def extend(self, chain: int) -> None:
         """Let a chain grow by its known track."""
@@ -171,13 +174,16 @@ class Fleet:
 
     def _place(
         self, header: Header, time_s: float, north_m: float, east_m: float, yaw_rad: float
-    ) -> bool:
-        """Keep a state that its track's neighbours allow; a lasting jump begins a new boot."""
+    ) -> int | None:
+        """Keep a state that its track's neighbours allow, and return its chain, or None.
+
+        A lasting jump begins a new boot.
+        """
         chain = self.chain(header)
         buffer = self._tracks.setdefault(chain, TrackBuffer())
         if buffer.is_plausible(time_s, north_m, east_m, self._settings.fastest_mps):
             buffer.add(time_s, north_m, east_m, yaw_rad)
-            return True
+            return chain
         jumped = self._followers[header.vehicle].jumped
         if jumped and not 0.0 <= time_s - jumped[-1][0] <= 60.0:
             jumped.clear()
@@ -189,7 +195,7 @@ class Fleet:
             jumped.clear()
             self._followers[header.vehicle].boot += BOOT_EPOCHS
             self.counters["lasting_jumps"] += 1
-        return False
+        return None
 
     def _begin(self, chain: int, track: Track) -> None:
         """Start a chain: a vehicle's first at its deployment, a later one where the last ended."""
@@ -200,6 +206,7 @@ class Fleet:
             self._graph.add_vehicle(chain, time_s, start_m, start_m)
             return
         before, old = earlier[-1], self.track(earlier[-1])
+        self._graph.extend(before, old)
         last_s = min(float(old.time_s[-1]), time_s)
         gap_s = time_s - last_s
         trajectory = self._graph.trajectory(before)

@@ -90,10 +90,10 @@ class JournaledLeader(LeaderCore):
         """Return the matches that wait; first those that a kill has cut short."""
         if self._unfinished:
             return self._unfinished.pop()
-        jobs = super().next_jobs()
-        if jobs is not None:
-            self.recorder.note(Kind.JOBS)
-        return jobs
+        if not self.has_jobs:
+            return None
+        self.recorder.note(Kind.JOBS)
+        return super().next_jobs()
 
     def finish(self, done: SheetJobs, findings: Findings, now_s: float) -> None:
         """Record what the matches found, and judge it as a replay will."""

@@ -46,12 +46,16 @@ class LoopClosing:
         """Let a sheet of the atlas wait for its matches; the oldest gives way."""
         self._waiting.append(sheet)
 
+    @property
+    def has_jobs(self) -> bool:
+        """Whether a sheet waits for its matches."""
+        return bool(self._waiting)
+
     def next_jobs(self) -> SheetJobs | None:
         """Return the matches of the oldest sheet that still waits for them, or None."""
         if not self._waiting:
             return None
         self._graph.update()
-        self.is_matching = True
         sheet, settings = self._waiting.popleft(), self._settings.closures
         try:
             jobs = jobs_for(sheet, self._atlas, self._graph, settings, self._calibrations)
@@ -60,6 +64,7 @@ class LoopClosing:
             jobs = []
         looks = self._open.second_looks(sheet, self._atlas, self._graph, self._calibrations)
         doubt, self._doubt = self._doubt, None
+        self.is_matching = True
         return SheetJobs(sheet=sheet, jobs=(*jobs, *looks), doubt=doubt)
 
     def finish(self, done: SheetJobs, findings: Findings, now_s: float) -> None:

@@ -1,6 +1,7 @@
 """Which pairs of sub-maps are worth a match, and all that each of these matches needs."""
 
 import dataclasses
+import logging
 from collections.abc import Set
 from dataclasses import dataclass
 
@@ -12,11 +13,14 @@ from firmware.leader.closure_settings import ClosureSettings
 from firmware.leader.displacement import Look
 from firmware.leader.drifts import NO_DRIFT, Drifts
 from firmware.leader.estimate import Estimate
+from firmware.leader.matches import NoMatch
 from firmware.leader.matching import MatchingSettings, MatchOutcome, match
 from firmware.leader.nonconvexity import Doubt
 from firmware.leader.offsets import Offset, correction_of, corrections, offsets_of
 from firmware.leader.pairing import Calibrations, Side, side_of, strain_m
 from firmware.submaps import GriddedSubmap
+
+LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,11 +88,27 @@ class SheetJobs:
     doubt: Doubt | None = None
 
     def run(self) -> Findings:
-        """Run all matches, in order."""
+        """Run all matches, in order; never raises: one that fails has no match for a reason."""
         return Findings(
-            outcomes=[job.run() for job in self.jobs],
-            false_closures=None if self.doubt is None else self.doubt.run(),
+            outcomes=[_outcome_of(job) for job in self.jobs],
+            false_closures=None if self.doubt is None else _false_by(self.doubt),
         )
+
+
+def _outcome_of(job: MatchJob) -> MatchOutcome:
+    try:
+        return job.run()
+    except Exception:
+        LOG.exception("the match of %s with %s failed", job.target.id, job.origin.id)
+        return MatchOutcome(match=None, reason=NoMatch.RAISED)
+
+
+def _false_by(doubt: Doubt) -> list[int] | None:
+    try:
+        return doubt.run()
+    except Exception:
+        LOG.exception("a doubt failed")
+        return None
 
 
 def jobs_for(

@@ -117,6 +117,7 @@ class NoMatch(enum.Enum):
     AMBIGUOUS = "another shift explains the data nearly as well"
     LOOSE = "the minimum is too wide in both directions"
     UNSETTLED = "no minimum could be refined below the cell"
+    RAISED = "the match failed by an error of its own, which the log has"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

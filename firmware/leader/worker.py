@@ -1,14 +1,11 @@
 """Who runs a sub-map's matches: the loop itself, or one thread beside it."""
 
-import logging
 import queue
 import threading
 from dataclasses import dataclass
 from typing import Protocol
 
 from firmware.leader.match_jobs import Findings, SheetJobs
-
-LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,9 +62,8 @@ class ThreadWorker:
 
     def __init__(self) -> None:
         self._in: queue.Queue[SheetJobs | None] = queue.Queue(maxsize=1)
-        self._out: queue.Queue[Finished | None] = queue.Queue(maxsize=1)
+        self._out: queue.Queue[Finished] = queue.Queue(maxsize=1)
         self._busy = False
-        self.failed = 0
         self._thread = threading.Thread(target=self._work, name="matches", daemon=True)
         self._thread.start()
 
@@ -88,7 +84,6 @@ class ThreadWorker:
         except queue.Empty:
             return None
         self._busy = False
-        self.failed += finished is None
         return finished
 
     def close(self) -> None:
@@ -98,8 +93,4 @@ class ThreadWorker:
 
     def _work(self) -> None:
         while (batch := self._in.get()) is not None:
-            try:
-                self._out.put(Finished(batch=batch, findings=batch.run()))
-            except Exception:
-                LOG.exception("the matches of %s failed", batch.sheet.id)
-                self._out.put(None)
+            self._out.put(Finished(batch=batch, findings=batch.run()))

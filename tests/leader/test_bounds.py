@@ -1,5 +1,7 @@
 """What keeps a long mission's memory bounded: packed sub-maps, covered places, rows of closures."""
 
+from typing import cast
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,9 @@ from firmware.leader.closure_log import ClosureLog, verdict_of
 from firmware.leader.closures import Closure, Stage
 from firmware.leader.coverage import CoverageSettings, redundant
 from firmware.leader.ledger import Anchor
-from firmware.leader.shelf import packed, unpacked
+from firmware.leader.match_jobs import MatchJob, SheetJobs
+from firmware.leader.matches import MatchOutcome, NoMatch
+from firmware.leader.shelf import MemoryShelf, packed, unpacked
 from firmware.submaps import GriddedSubmap, Track
 
 RNG = np.random.default_rng(5)
@@ -89,6 +93,31 @@ def test_shelved_sheet_is_not_matched_but_stays_part_of_the_map() -> None:
     for k in range(3, 14):
         atlas.add(sheet_at(0.0, k))
     assert (len(list(atlas.grids())), atlas.dropped) == (10, 4)
+
+
+def test_what_the_atlas_drops_leaves_its_shelf() -> None:
+    shelf = MemoryShelf()
+    atlas = Atlas(3, shelf)
+    for submap in range(6):
+        atlas.add(sheet_at(0.0, submap))
+        atlas.shelve(SheetId(vehicle=0, boot_epoch=0, submap=submap))
+    assert atlas.dropped == 3
+    assert [shelf.get(f"0/0/{submap}") is None for submap in range(6)] == [True] * 3 + [False] * 3
+
+
+def test_a_match_that_fails_is_a_reason_not_the_end_of_its_batch(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    class Broken:
+        origin, target = sheet_at(0.0, 0), sheet_at(0.0, 1)
+
+        def run(self) -> MatchOutcome:
+            raise ValueError("no such grid")
+
+    jobs = cast("tuple[MatchJob, ...]", (Broken(), Broken()))
+    findings = SheetJobs(sheet=Broken.target, jobs=jobs).run()
+    assert [outcome.reason for outcome in findings.outcomes] == [NoMatch.RAISED] * 2
+    assert "the match of" in caplog.text
 
 
 def test_places_that_are_covered_need_no_further_sub_map() -> None:

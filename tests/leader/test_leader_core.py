@@ -17,7 +17,7 @@ from protocol.packets import (
     SubmapPacket,
     TrajectoryPacket,
 )
-from tests.leader.vessels import Convoy, convoy, follower_of, leader_of, line, slots_of
+from tests.leader.vessels import Convoy, convoy, follower_of, leader_of, line, sail, slots_of
 
 
 def frames_of(**changes: Any) -> list[tuple[bytes, float]]:
@@ -279,6 +279,49 @@ def test_follower_whose_clock_is_set_back_is_heard_again() -> None:
         leader.receive_frame(trajectory(walked(20, 2.0 * now_s), theirs_s), None, float(now_s))
     assert leader.track(1).time_s[-1] >= 239.0
     assert leader.vehicles() == [0, 1]
+
+
+def test_navigation_between_whole_seconds_is_tracked_as_well() -> None:
+    path = line(0.0, 0.0)
+    leader = leader_of(path)
+    for k in range(400):
+        sail(leader, path, 0.003 + 0.25 * k)
+    assert len(leader.track(0).time_s) == 100
+    assert leader.graph.nodes >= 6  # of sub-maps that end every twenty seconds
+
+
+def test_own_sub_map_does_not_reach_over_a_gap_in_navigation() -> None:
+    path = line(0.0, 0.0)
+    leader = leader_of(path, hop_s=10.0)
+    for begin_s in (0.0, 400.0):
+        for k in range(400):
+            sail(leader, path, begin_s + 0.25 * k)
+    spans_s = [np.ptp(sheet.track.time_s) for sheet in leader.atlas]
+    assert len(spans_s) > 10
+    assert max(spans_s) <= 20.0
+
+
+@pytest.mark.parametrize("toa_s", [np.nan, np.inf, -np.inf, 5000.0])
+def test_arrival_at_no_time_is_no_range(toa_s: float) -> None:
+    leader = sailed()
+    for frame, _ in FRAMES:
+        leader.receive_frame(frame, toa_s, 100.0)
+    leader.tick(100.0)
+    assert leader.status()["arrivals_impossible"] == len(FRAMES)
+    assert leader.status()["frames_received"] == len(FRAMES)
+    assert len(leader.track(1).time_s) > 20
+
+
+def test_lasting_jump_at_the_end_of_a_packet_silences_nobody() -> None:
+    leader = sailed()
+    for first_s in (0.0, 20.0, 40.0):
+        leader.receive_frame(trajectory(walked(20, 2.0 * first_s), first_s), None, 100.0)
+    states = walked(40, 120.0)
+    states[10:, 0] += 500.0
+    header = decode(trajectory(walked(20, 0.0), 60.0)).header
+    leader._arrivals._receive_states(header, 60.0, states, 104.0)
+    assert leader.status()["lasting_jumps"] == 1
+    assert leader.poll(111.0) is not None
 
 
 def test_no_bytes_whatever_raise() -> None:

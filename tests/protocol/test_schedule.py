@@ -43,6 +43,16 @@ def test_the_next_slot_is_never_in_the_past(now_s: float, vehicle: int) -> None:
     assert slots.next_slot_s(vehicle, now_s) % 1.0 == 0.0
 
 
+@pytest.mark.parametrize("vehicle", [0, 3])
+def test_a_slot_minutes_ahead_has_yet_to_come_unless_the_clock_was_set_back(vehicle: int) -> None:
+    slots = Slots(SlotSettings(followers=14, follower_slot_s=10, leader_period_s=140))
+    next_s = slots.next_slot_s(vehicle, 1000.0)
+    after_s = slots.next_slot_s(vehicle, next_s + 1e-3)
+    assert slots.is_between(vehicle, after_s, next_s + 1.0)
+    assert not slots.is_between(vehicle, after_s, after_s)
+    assert not slots.is_between(vehicle, after_s, after_s - 500.0)
+
+
 def test_slots_that_cannot_be_are_refused() -> None:
     with pytest.raises(ConfigError, match="from 0 to 19"):
         SlotSettings(leader_offsets_s=(3, 25))

@@ -6,6 +6,7 @@ takes what `fathomlink simulate` takes. Speed is that of the mission alone, one 
 """
 
 import argparse
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from host_tools.commands import add_mission_arguments, settings_of
+from host_tools.commands import add_mission_arguments, settings_of, status_of
 from host_tools.evaluation import Evaluation, JudgedClosure, evaluate
 from host_tools.simulate import simulate
 
@@ -110,4 +111,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(status_of("benchmarks.accuracy", main))

@@ -8,12 +8,13 @@ at hour H is of the hour before H; one of some followers is of their mission's l
 """
 
 import argparse
+import sys
 from pathlib import Path
 
 import matplotlib as mpl
 
 from benchmarks.days import HEAD, Row, lasting, mission
-from host_tools.commands import add_mission_arguments, settings_of
+from host_tools.commands import add_mission_arguments, settings_of, status_of
 from host_tools.mission_settings import changed
 
 mpl.use("Agg")
@@ -90,4 +91,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(status_of("benchmarks.cost", main))

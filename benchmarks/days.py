@@ -22,7 +22,7 @@ import matplotlib as mpl
 import numpy as np
 
 from benchmarks.days_vehicle import Aboard, Gauge, Heard, NoLog, Order
-from host_tools.commands import add_mission_arguments, settings_of
+from host_tools.commands import add_mission_arguments, settings_of, status_of
 from host_tools.mission import deployed, run, simulated_vehicles, water_between
 from host_tools.mission_settings import MissionSettings, changed
 from host_tools.nodes import BeliefLog
@@ -225,4 +225,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(status_of("benchmarks.days", main))

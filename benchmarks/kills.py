@@ -8,6 +8,7 @@ frame in the water was the same, how far the final estimates lie apart, and what
 """
 
 import argparse
+import sys
 import tempfile
 import time
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from firmware.follower.journaled import JournaledFollower
 from firmware.geometry import Array
 from firmware.journal import JournalSettings, Owner
 from firmware.leader.journaled import JournaledLeader
-from host_tools.commands import add_mission_arguments, settings_of
+from host_tools.commands import add_mission_arguments, settings_of, status_of
 from host_tools.kills import Fate, MortalJournal, MortalNode, SensorTape
 from host_tools.mission import deployed, run, simulated_vehicles, water_between
 from host_tools.mission_settings import MissionSettings
@@ -158,4 +159,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(status_of("benchmarks.kills", main))

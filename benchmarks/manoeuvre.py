@@ -11,6 +11,7 @@ The proposal is found from the estimate alone; the truth is used to measure.
 
 import argparse
 import math
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from threadpoolctl import threadpool_limits
 from firmware.geometry import Array
 from firmware.leader.core import LeaderCore
 from firmware.leader.manoeuvre import Proposal
-from host_tools.commands import add_mission_arguments, settings_of
+from host_tools.commands import add_mission_arguments, settings_of, status_of
 from host_tools.mission import local_nodes, run, simulated_vehicles, water_between
 from host_tools.mission_settings import MissionSettings, changed
 from host_tools.simulator.placement import place_survey
@@ -113,4 +114,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(status_of("benchmarks.manoeuvre", main))

@@ -8,12 +8,13 @@ Micro-Modems at rate 4, whose packets hold two frames that are lost together.
 
 import argparse
 import json
+import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
 
-from host_tools.commands import add_mission_arguments
+from host_tools.commands import add_mission_arguments, status_of
 from host_tools.processes.demo import run_demo
 from host_tools.processes.emulated_modems import MODEMS
 from host_tools.processes.voyage import Voyage, voyage_of
@@ -61,4 +62,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(status_of("benchmarks.modems", main))

@@ -7,13 +7,14 @@ and loses none. A coder is a profile, or a profile and its frames: `--coder latt
 """
 
 import argparse
+import sys
 from pathlib import Path
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from benchmarks.accuracy import Figures, figures
-from host_tools.commands import add_mission_arguments, settings_of
+from host_tools.commands import add_mission_arguments, settings_of, status_of
 from host_tools.evaluation import evaluate
 from host_tools.simulate import simulate
 
@@ -73,4 +74,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(status_of("benchmarks.navigation", main))

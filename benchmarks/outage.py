@@ -8,13 +8,14 @@ last until minute 120. Errors are of live beliefs, over spans of ten minutes.
 
 import argparse
 import math
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from host_tools.commands import add_mission_arguments, settings_of
+from host_tools.commands import add_mission_arguments, settings_of, status_of
 from host_tools.mission_settings import MissionSettings, changed
 from host_tools.simulate import simulate
 
@@ -78,4 +79,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(status_of("benchmarks.outage", main))

@@ -1,7 +1,6 @@
 """The `fathomlink` command: reads arguments, calls the module that does the work."""
 
 import argparse
-import os
 import sys
 from collections.abc import Sequence
 from typing import NoReturn
@@ -16,12 +15,11 @@ from host_tools import (
     reproduce,
     simulate,
 )
-from host_tools.commands import Command
+from host_tools.commands import BAD_INPUT, Command, status_of
 from host_tools.emulators import emulate
 from host_tools.faults import command as faults
 from host_tools.processes import channel, demo, vehicle
 from host_tools.replay import gsf
-from protocol.errors import FathomError
 
 COMMANDS: tuple[Command, ...] = (
     simulate.COMMAND,
@@ -39,7 +37,6 @@ COMMANDS: tuple[Command, ...] = (
     link_status.COMMAND,
     config_show.COMMAND,
 )
-BAD_INPUT = 2
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -67,22 +64,8 @@ def build_parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one subcommand; return 0, or 2 with one line on stderr that says what is wrong."""
     parsed = build_parser().parse_args(arguments)
-    try:
-        with threadpool_limits(1):  # so that the same seed gives the same bytes
-            parsed.run(parsed)
-        sys.stdout.flush()
-    except FathomError as error:
-        print(f"fathomlink: {' '.join(str(error).split())}", file=sys.stderr)
-        return BAD_INPUT
-    except BrokenPipeError:  # the reader, such as `head`, has had enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except OSError as error:
-        print(f"fathomlink: {error.filename}: {error.strerror}", file=sys.stderr)
-        return BAD_INPUT
-    except KeyboardInterrupt:
-        print("fathomlink: interrupted", file=sys.stderr)
-        return BAD_INPUT
-    return 0
+    with threadpool_limits(1):  # so that the same seed gives the same bytes
+        return status_of("fathomlink", lambda: parsed.run(parsed))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,8 @@
 """What a subcommand is, and the arguments that several of them share."""
 
 import argparse
+import os
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,11 +10,12 @@ from pathlib import Path
 from firmware.follower.settings import FollowerSettings
 from host_tools.mission_settings import MissionSettings, changed
 from host_tools.scenario import load_scenario
-from protocol.errors import ConfigError
+from protocol.errors import ConfigError, FathomError
 
 PROFILES = ("paper", "dense", "lattice")
 CHOICES = (*PROFILES, "auto")
 BASELINES = ("none", "unlimited", "octree")
+BAD_INPUT = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,13 +28,32 @@ class Command:
     run: Callable[[argparse.Namespace], None]
 
 
+def status_of(name: str, work: Callable[[], None]) -> int:
+    """Do the work; return 0, or 2 with one line on stderr that says what is wrong."""
+    try:
+        work()
+        sys.stdout.flush()
+    except FathomError as error:
+        print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
+        return BAD_INPUT
+    except BrokenPipeError:  # the reader, such as `head`, has had enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:
+        print(f"{name}: {error.filename}: {error.strerror}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print(f"{name}: interrupted", file=sys.stderr)
+        return BAD_INPUT
+    return 0
+
+
 def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
     """Add --scenario, --loss and --set."""
     parser.add_argument(
         "--scenario",
         default="paper-1",
         metavar="NAME|FILE.toml",
-        help="paper-1, paper-2, field-1, day-1, or a file of scenario keys (default: paper-1)",
+        help="paper-1, paper-2, field-1, day-1, or a file of scenario keys (default: %(default)s)",
     )
     parser.add_argument(
         "--loss", type=float, metavar="P", help="share of frames lost per receiver, both ways"

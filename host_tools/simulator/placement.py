@@ -104,7 +104,8 @@ def place_survey(raster: Raster, scenario: ScenarioSettings, seed: int) -> Site:
         raise ConfigError(
             f"terrain {raster.name} holds data under {share:.0%} of the survey at northing "
             f"{corner[0]:.0f}, easting {corner[1]:.0f}; {LEAST_DATA_SHARE:.0%} is needed: "
-            "move it with --set survey_north_m, survey_east_m or shorten leg_m, duration_min"
+            "move it with --set survey_north_m, survey_east_m, or shorten it with leg_m, "
+            "duration_min or follower_duration_min"
         )
     mean_m, shallowest_m = -float(np.nanmean(elevation_m)), -float(np.nanmax(elevation_m))
     shift_m = scenario.vehicle_depth_m + max(
@@ -163,7 +164,7 @@ def _check_size(raster: Raster, scenario: ScenarioSettings, tracks: Box) -> None
         raise ConfigError(
             f"terrain {raster.name} is {have[0]:.0f} x {have[1]:.0f} m (north x east); scenario "
             f"{scenario.name} needs {need[0]:.0f} x {need[1]:.0f} m: shorten it with "
-            "--set leg_m, line_spacing_m or duration_min"
+            "--set leg_m, line_spacing_m, duration_min or follower_duration_min"
         )
 
 

@@ -165,6 +165,7 @@ class FollowerCore:
             "bad_odometry": self._reckoning.bad_samples,
             "bad_beams": self._builder.bad_beams,
             "bad_pings": self._builder.bad_pings,
+            "submaps_overwritten": self._builder.submaps_overwritten,
             "answers_used": self._correction.accepted,
             "answers_without_news": self._correction.empty,
             "answers_gated": self._correction.gated,

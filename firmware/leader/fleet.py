@@ -22,6 +22,7 @@ from firmware.submaps import Track
 from protocol.errors import EstimationError
 from protocol.packets import Header, usable_states
 from protocol.settings import Settings, setting
+from protocol.timestamps import from_quarters
 
 _CONTINUES_M = 3.0  # dead reckoning that goes on lies this near to a straight continuation
 
@@ -63,6 +64,11 @@ class Fleet:
         """The leader's own track."""
         return self._tracks[LEADER]
 
+    @property
+    def overflowed(self) -> int:
+        """How many states found no room in the track of their chain."""
+        return sum(buffer.overflowed for buffer in self._tracks.values())
+
     def vehicles(self) -> list[int]:
         """Return the vehicles that have a chain, the leader first."""
         return sorted({vehicle_of(chain) for chain in self._graph.vehicles()})
@@ -73,11 +79,12 @@ class Fleet:
         if known is None:
             known = self._followers[header.vehicle] = _Vehicle(boot=header.boot_epoch)
         ahead = (header.boot_epoch - known.boot) % BOOT_EPOCHS
-        if (
-            ahead >= BOOT_EPOCHS // 2
-            and chain_of(header.vehicle, known.boot + ahead - BOOT_EPOCHS) in self._tracks
+        earlier = known.boot + ahead - BOOT_EPOCHS
+        if ahead >= BOOT_EPOCHS // 2 and (
+            chain_of(header.vehicle, earlier) in self._tracks
+            or self._precedes(header, chain_of(header.vehicle, known.boot))
         ):
-            return known.boot + ahead - BOOT_EPOCHS
+            return earlier
         if ahead:
             known.boot += ahead
             known.jumped.clear()
@@ -185,6 +192,8 @@ class Fleet:
             buffer.add(time_s, north_m, east_m, yaw_rad)
             return chain
         jumped = self._followers[header.vehicle].jumped
+        if any(time_s == known_s for known_s, _, _ in jumped):
+            return None  # told again, as every frame of a sub-map may tell its whole track
         if jumped and not 0.0 <= time_s - jumped[-1][0] <= 60.0:
             jumped.clear()
         reach_m = self._settings.fastest_mps * (time_s - jumped[-1][0]) + 1.0 if jumped else np.inf
@@ -196,6 +205,14 @@ class Fleet:
             self._followers[header.vehicle].boot += BOOT_EPOCHS
             self.counters["lasting_jumps"] += 1
         return None
+
+    def _precedes(self, header: Header, chain: int) -> bool:
+        """Return whether a frame speaks of a time before a chain began."""
+        buffer = self._tracks.get(chain)
+        if buffer is None or not len(buffer):
+            return False
+        begun_s = float(buffer.track().time_s[0])
+        return from_quarters(header.time_quarters, begun_s) < begun_s
 
     def _begin(self, chain: int, track: Track) -> None:
         """Start a chain: a vehicle's first at its deployment, a later one where the last ended."""

@@ -43,7 +43,8 @@ class LoopClosing:
         self._settled = ClosureLog()
 
     def add(self, sheet: Sheet) -> None:
-        """Let a sheet of the atlas wait for its matches; the oldest gives way."""
+        """Let a sheet of the atlas wait for its matches; the oldest gives way, counted."""
+        self._counters["submaps_unmatched"] += len(self._waiting) == self._waiting.maxlen
         self._waiting.append(sheet)
 
     @property
@@ -117,8 +118,9 @@ class LoopClosing:
         yield from map(verdict_of, self._closures)
 
     def status(self) -> dict[str, int]:
-        """Return the counters of judgement and open pairs."""
-        return {**self._judgement.counters, **self._open.counters}
+        """Return the counters of judgement, of open pairs, and of verdicts that found no room."""
+        verdicts = {"verdicts_overwritten": self._settled.overwritten}
+        return {**self._judgement.counters, **self._open.counters, **verdicts}
 
     @property
     def open_submaps(self) -> int:

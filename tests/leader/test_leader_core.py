@@ -160,6 +160,17 @@ def test_late_frame_of_an_earlier_boot_does_not_start_another() -> None:
     assert len(leader.track(1).time_s) == 80
 
 
+def test_late_frame_of_a_boot_never_heard_does_not_start_another() -> None:
+    leader = sailed(40.0)
+    for boot, first_s in ((1, 60.0), (0, 20.0), (1, 80.0)):
+        leader.receive_frame(
+            changed(trajectory(walked(20, 2.0 * first_s), first_s), boot_epoch=boot), None, 100.0
+        )
+    assert leader.status().get("restarts", 0) == 0
+    assert len(leader.graph.vehicles()) == 3
+    assert leader.track(1).time_s == pytest.approx([*range(20, 40), *range(60, 100)])
+
+
 def test_fragments_out_of_order_and_twice_make_the_same_sheets() -> None:
     frames = [frame for frame, _ in FRAMES]
     in_order = hear(sailed(), frames)
@@ -223,6 +234,16 @@ def test_trajectory_that_jumps_for_good_goes_on_as_a_new_chain() -> None:
     assert leader.status()["lasting_jumps"] == 1
     assert leader.track(1).north_m.max() > 5000.0
     assert leader.vehicles() == [0, 1]
+
+
+def test_lasting_jump_is_found_in_packets_that_overlap() -> None:
+    leader = sailed()
+    for first_s in range(0, 80, 4):
+        states = walked(20, 2.0 * first_s)
+        states[np.arange(first_s, first_s + 20) >= 40, 0] += 500.0
+        leader.receive_frame(trajectory(states, float(first_s)), None, 100.0)
+    assert leader.status()["lasting_jumps"] == 1
+    assert leader.track(1).north_m.max() > 500.0
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e30])

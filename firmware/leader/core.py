@@ -29,7 +29,7 @@ from firmware.leader.outlook import Outlook
 from firmware.leader.own_grid import grid_of
 from firmware.leader.pose_graph import PoseGraph
 from firmware.leader.ranging import Ranging
-from firmware.leader.settings import LeaderSettings, patient_reassembly
+from firmware.leader.settings import LeaderSettings, reassembly_of
 from firmware.leader.shelf import Shelf
 from firmware.leader.trajectory import Trajectory
 from firmware.soundings import Odometry, Ping
@@ -73,7 +73,7 @@ class LeaderCore:
         hops = max(1, round(settings.submaps.duration_s / settings.hop_s))
         self._stretches: deque[Submap] = deque(maxlen=hops)
         self._tracked_s = -math.inf  # the newest state of the own track
-        self._reassembler = Reassembler(patient_reassembly(settings, slots))
+        self._reassembler = Reassembler(reassembly_of(settings, slots))
         self._ranging = Ranging(settings.ranges)
         self.fleet = Fleet(self.graph, self._ranging, settings.fleet)
         self._fixes = Fixes(settings.fixes)

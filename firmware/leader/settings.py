@@ -21,6 +21,8 @@ from protocol.reassembly import ReassemblySettings
 from protocol.schedule import Slots
 from protocol.settings import Settings, setting
 
+_MOST_FRAGMENTS = 15  # of a sub-map: what the header's four bits can tell
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LeaderSettings(Settings):
@@ -62,9 +64,20 @@ class LeaderSettings(Settings):
     )
 
 
-def patient_reassembly(settings: LeaderSettings, slots: Slots) -> ReassemblySettings:
-    """Return the reassembly's settings: it waits longer where followers have air for repeats."""
+def reassembly_of(settings: LeaderSettings, slots: Slots) -> ReassemblySettings:
+    """Return the reassembly's settings as the raster of the air asks for.
+
+    Many followers need room, and take long to send a sub-map; where they have air for repeats, it
+    waits for those.
+    """
+    told, air = settings.reassembly, slots.settings
+    longest_s = float(_MOST_FRAGMENTS * air.follower_slot_s * air.followers)
+    sized = dataclasses.replace(
+        told,
+        slots=max(told.slots, 2 * air.followers),  # a current and an overtaken sub-map each
+        oldest_s=max(told.oldest_s, longest_s),
+    )
     if settings.answers != "extended":
-        return settings.reassembly
+        return sized
     room = slots.frames_per_submap(settings.submaps.duration_s)
-    return dataclasses.replace(settings.reassembly, fragments_with_repeats=max(room - 1, 0))
+    return dataclasses.replace(sized, fragments_with_repeats=max(room - 1, 0))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from firmware.leader.core import LeaderCore
+from firmware.leader.settings import LeaderSettings, reassembly_of
 from protocol.codec import decode, encode
 from protocol.packets import (
     Answer,
@@ -17,6 +18,7 @@ from protocol.packets import (
     SubmapPacket,
     TrajectoryPacket,
 )
+from protocol.schedule import Slots, SlotSettings
 from tests.leader.vessels import Convoy, convoy, follower_of, leader_of, line, sail, slots_of
 
 
@@ -97,6 +99,14 @@ def test_four_followers_have_each_a_chain_and_a_turn() -> None:
     for vehicle in (1, 2, 3, 4):
         assert sheets_of(four.leader, vehicle)
         assert four.followers[vehicle][0].status()["answers_used"] >= 2
+
+
+def test_fourteen_followers_have_room_and_time_for_their_sub_maps() -> None:
+    slots = Slots(SlotSettings(followers=14, follower_slot_s=4))
+    sized = reassembly_of(LeaderSettings(), slots)
+    assert sized.slots >= 28
+    assert sized.oldest_s >= 10 * 14 * 4.0
+    assert reassembly_of(LeaderSettings(), slots_of()) == LeaderSettings().reassembly
 
 
 def test_answer_speaks_of_the_newest_state_known() -> None:

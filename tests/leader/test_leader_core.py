@@ -148,6 +148,24 @@ def test_restart_with_dead_reckoning_unbroken_keeps_a_tight_link() -> None:
     assert np.sqrt(link_m2[0, 0]) < 30.0
 
 
+@pytest.mark.parametrize("last_s", range(162, 182, 4))
+def test_restart_is_tied_to_the_old_chain_whenever_it_comes(last_s: int) -> None:
+    leader = sailed(100.0)
+    for time_s in range(101, 400):
+        leader.fleet.own.add(float(time_s), 2.0 * time_s, 0.0, 0.0)
+    for boot, times_s in ((0, range(106, last_s, 4)), (1, range(last_s + 10, last_s + 70, 4))):
+        for first_s in times_s:  # slices of four seconds, as the paper's frames carry them
+            header = decode(trajectory(walked(4, 0.0), float(first_s))).header
+            leader._arrivals._receive_states(
+                dataclasses.replace(header, boot_epoch=boot),
+                float(first_s),
+                walked(4, 2.0 * first_s),
+                first_s + 44.0,
+            )
+    assert leader.status()["restarts"] == 1
+    assert leader.status().get("restarts_untied", 0) == 0
+
+
 def test_restarts_beyond_the_header_s_four_bits_are_still_told_apart() -> None:
     leader = sailed(40.0)
     for boot in range(20):

@@ -37,7 +37,7 @@ class JudgementSettings(Settings):
     """What it takes to believe a closure."""
 
     known_sigma_m: float = setting(
-        5.0, "m", "an offset known so well leaves a false match no room", minimum=0.1
+        7.0, "m", "an offset known so well leaves a false match no room", minimum=0.1
     )
     waiting: int = setting(
         48, "closures", "gated but not believed; the oldest is given up", minimum=2, maximum=200

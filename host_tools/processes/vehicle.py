@@ -98,8 +98,13 @@ def run_vehicle(
         check_frame_size(modem.largest_frame_bytes, frame_bytes, profile)
         ticks = clock.ticks(voyage.tick_s)
         first_s = next(ticks, None)
-        if first_s is None and isinstance(clock, WallClock) and not is_at_sea:
-            raise ConfigError(f"the mission that starts at {start} is over; give a later --start")
+        if first_s is None and not is_at_sea:
+            if isinstance(clock, ServedClock):
+                clock.end()  # lest the others wait for our files
+            raise ConfigError(
+                "the mission is over and no store holds it; give a later --start, or --store DIR"
+                " from the beginning"
+            )
         if first_s is None:  # it was killed after its last instant: the store has the mission
             first_s = voyage.settings.scenario.duration_s + voyage.tick_s
             sailed: Iterator[float] = iter(())

@@ -1,0 +1,87 @@
+"""A process that is killed between its last instant and its last file."""
+
+import argparse
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from host_tools.processes import vehicle
+from host_tools.processes.fleet import Fleet
+from host_tools.processes.voyage import Voyage, add_voyage_arguments, voyage_of
+from protocol.acoustics import Water, WaterSettings
+from protocol.errors import ConfigError
+
+SHORT = ["--set", "duration_min=0.5", "--set", "follower_duration_min=0.5", "--set", "beams=32"]
+
+
+class Killed(BaseException):
+    """What no code catches, as a kill."""
+
+
+@pytest.fixture
+def voyage() -> Voyage:
+    parser = argparse.ArgumentParser()
+    add_voyage_arguments(parser)
+    return voyage_of(parser.parse_args(SHORT))
+
+
+@pytest.fixture
+def fleet(voyage: Voyage, tmp_path: Path) -> Iterator[Fleet]:
+    water = Water(
+        WaterSettings(), np.random.default_rng(1), lambda *_: (0.0, 0.0, 10.0), nodes=range(1)
+    )
+    fleet = Fleet(water, voyage.fingerprint, on_wait=lambda _: None, folder=tmp_path / "p")
+    yield fleet
+    fleet.close()
+
+
+def lived(fleet: Fleet, voyage: Voyage, folder: Path, store: Path | None) -> BaseException | None:
+    """Run the leader's process to its end; return what ended it."""
+    ended: list[BaseException] = []
+
+    def live() -> None:
+        try:
+            out = folder / "out"
+            vehicle.run_vehicle(0, fleet.modem_url(0), fleet.clock_url, voyage, out, "next", store)
+        except BaseException as error:
+            ended.append(error)
+
+    thread = threading.Thread(target=live, daemon=True)
+    thread.start()
+    if not (folder / "out").exists():  # the first life is served its mission
+        fleet.wait_for_all()
+        for step in range(round(voyage.settings.scenario.duration_s / 0.25) + 1):
+            fleet.nodes[0].tick(step * 0.25)
+        threading.Thread(target=fleet.end, daemon=True).start()
+    thread.join(60.0)
+    assert not thread.is_alive()
+    return ended[0] if ended else None
+
+
+@pytest.mark.parametrize("has_store", [True, False])
+def test_process_killed_after_its_last_instant_ends_the_mission_when_it_starts_again(
+    voyage: Voyage,
+    fleet: Fleet,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    has_store: bool,
+) -> None:
+    def killed(*_: object) -> None:
+        raise Killed
+
+    store = tmp_path / "store" if has_store else None
+    with monkeypatch.context() as patch:
+        patch.setattr(vehicle, "_write", killed)
+        assert isinstance(lived(fleet, voyage, tmp_path, store), Killed)
+    again = lived(fleet, voyage, tmp_path, store)
+    files = {path.name for path in (tmp_path / "out" / "processes").iterdir()}
+    if has_store:
+        assert again is None
+        assert {"leader.npz", "leader.json"} <= files
+    else:
+        assert isinstance(again, ConfigError)
+        assert "no store holds it" in str(again)
+        assert "leader.npz" not in files

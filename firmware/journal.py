@@ -9,7 +9,6 @@ What is wrong with a store never stops a mission: a file that cannot be used is 
 another name, and one that cannot be written is counted while the mission goes on in memory.
 """
 
-import contextlib
 import logging
 import sqlite3
 import zlib
@@ -142,9 +141,11 @@ class Journal:
             self.counters["store_shelf_lost"] += 1
 
     def drop(self, name: str) -> None:
-        """Throw away what was put away; where the disk does not allow it, it stays."""
-        with contextlib.suppress(sqlite3.Error):
+        """Throw away what was put away; where the disk does not allow it, it stays, counted."""
+        try:
             self._file.drop(name)
+        except sqlite3.Error:
+            self.counters["store_shelf_stuck"] += 1
 
     def get(self, name: str) -> bytes | None:
         """Return what was put away under a name, or None."""

@@ -41,7 +41,7 @@ from protocol.packets import SealedFrame, SubmapFragment, SubmapPacket, Trajecto
 from protocol.reassembly import Reassembler
 from protocol.schedule import Slots
 
-_AHEAD_S = 1.0  # of our clock: no frame has arrived that much later than now
+_AHEAD_S = 1.0  # of our clock: an arrival later than that is a modem's error
 
 
 class LeaderCore:

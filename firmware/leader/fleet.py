@@ -80,9 +80,13 @@ class Fleet:
             known = self._followers[header.vehicle] = _Vehicle(boot=header.boot_epoch)
         ahead = (header.boot_epoch - known.boot) % BOOT_EPOCHS
         earlier = known.boot + ahead - BOOT_EPOCHS
-        if ahead >= BOOT_EPOCHS // 2 and (
-            chain_of(header.vehicle, earlier) in self._tracks
-            or self._precedes(header, chain_of(header.vehicle, known.boot))
+        if (
+            ahead >= BOOT_EPOCHS // 2
+            and earlier >= 0
+            and (
+                chain_of(header.vehicle, earlier) in self._tracks
+                or self._precedes(header, chain_of(header.vehicle, known.boot))
+            )
         ):
             return earlier
         if ahead:

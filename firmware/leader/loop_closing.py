@@ -44,7 +44,8 @@ class LoopClosing:
 
     def add(self, sheet: Sheet) -> None:
         """Let a sheet of the atlas wait for its matches; the oldest gives way, counted."""
-        self._counters["submaps_unmatched"] += len(self._waiting) == self._waiting.maxlen
+        if len(self._waiting) == self._waiting.maxlen:
+            self._counters["submaps_unmatched"] += 1
         self._waiting.append(sheet)
 
     @property

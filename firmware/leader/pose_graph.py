@@ -175,7 +175,7 @@ class PoseGraph(Estimate):
     def compose(self, now_s: float, settings: CompositionSettings) -> None:
         """Make the past coarse, learn how much drift wanders, and restart ISAM2 from the ledger."""
         self.update()
-        self._learn_walk(now_s)
+        walk = self._learned_walk(now_s)
         estimate = self._states()
         pinned, detail_s = pinned_keys(self._ledger.values()), detail_from_s(now_s, settings)
         kept = {
@@ -187,6 +187,7 @@ class PoseGraph(Estimate):
             owners |= chain.owners(kept[vehicle])
         apart_m2 = self.apart_m2(owners)
         shapes = {vehicle: self.trajectory(vehicle).until(detail_s) for vehicle in self._chains}
+        self._walk = walk
         for vehicle, chain in self._chains.items():
             chain.drop(kept[vehicle], shapes[vehicle])
         old = {
@@ -205,10 +206,13 @@ class PoseGraph(Estimate):
         self._solver.restart(self._states())
         self._forget_solution()
 
-    def _learn_walk(self, now_s: float) -> None:
+    def _learned_walk(self, now_s: float) -> float:
         s, changes = self._settings, self.drift_changes(now_s)
-        if changes:
-            self._walk *= likely_walk(changes, s.bias_walk, s.walk_factor) / expected_walk(changes)
+        if not changes:
+            return self._walk
+        return (
+            self._walk * likely_walk(changes, s.bias_walk, s.walk_factor) / expected_walk(changes)
+        )
 
     def _append(self, chain: Chain, time_s: float, reckoned_m: Array, state: Array) -> int:
         key: int = gtsam.symbol("x", (chain.number << 24) | chain.added)

@@ -17,11 +17,10 @@ from firmware.leader.ranges import RangeSettings
 from firmware.leader.reconstruction import ReconstructionSettings
 from firmware.soundings import SonarSettings
 from firmware.submap_builder import SubmapSettings
+from protocol.packets import MAX_FRAGMENTS
 from protocol.reassembly import ReassemblySettings
 from protocol.schedule import Slots
 from protocol.settings import Settings, setting
-
-_MOST_FRAGMENTS = 15  # of a sub-map: what the header's four bits can tell
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,11 +70,11 @@ def reassembly_of(settings: LeaderSettings, slots: Slots) -> ReassemblySettings:
     waits for those.
     """
     told, air = settings.reassembly, slots.settings
-    longest_s = float(_MOST_FRAGMENTS * air.follower_slot_s * air.followers)
+    sending_s = float(MAX_FRAGMENTS * air.follower_slot_s * air.followers)
     sized = dataclasses.replace(
         told,
         slots=max(told.slots, 2 * air.followers),  # a current and an overtaken sub-map each
-        oldest_s=max(told.oldest_s, longest_s),
+        oldest_s=max(told.oldest_s, min(sending_s, settings.fleet.oldest_state_s)),
     )
     if settings.answers != "extended":
         return sized

@@ -57,9 +57,10 @@ class VehicleFiles:
             self._path(suffix).unlink(missing_ok=True)
 
     def note(self, belief: Belief, reckoned: ReckonedState) -> None:
-        """Append one second to the beliefs."""
+        """Append one second to the beliefs, over what a full disk may have left of another."""
         row = np.array(belief_row(belief, reckoned), dtype="<f8")
         with self._path("beliefs").open("ab") as stream:
+            stream.truncate(stream.tell() // _ROW_BYTES * _ROW_BYTES)
             stream.write(row.tobytes())
 
     def beliefs(self, time_s: Array) -> dict[str, np.ndarray]:

@@ -230,6 +230,7 @@ def test_composition_that_fails_leaves_the_graph_as_it_was(
         patch.setattr(voyage.graph, "apart_m2", fails)
         with pytest.raises(EstimationError):
             voyage.graph.compose(3000.0, SETTINGS)
+    assert voyage.graph.wandering.walk == GraphSettings().bias_walk
     voyage.run(3000, 3600)
     voyage.graph.compose(3600.0, SETTINGS)
     assert np.mean(voyage.misses_m(0)) < 3.0

@@ -8,8 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from firmware.belief import Belief
+from firmware.dead_reckoning import ReckonedState
 from host_tools.processes import vehicle
 from host_tools.processes.fleet import Fleet
+from host_tools.processes.records import VehicleFiles
 from host_tools.processes.voyage import Voyage, add_voyage_arguments, voyage_of
 from protocol.acoustics import Water, WaterSettings
 from protocol.errors import ConfigError
@@ -85,3 +88,18 @@ def test_process_killed_after_its_last_instant_ends_the_mission_when_it_starts_a
         assert isinstance(again, ConfigError)
         assert "no store holds it" in str(again)
         assert "leader.npz" not in files
+
+
+def test_half_a_row_that_a_full_disk_left_spoils_no_later_one(tmp_path: Path) -> None:
+    files = VehicleFiles(tmp_path, 0)
+    files.prepare()
+    for second in range(4):
+        state = ReckonedState(time_s=second, north_m=1.0, east_m=2.0, yaw_rad=0.0, depth_m=5.0)
+        belief = Belief(time_s=second, position_m=np.ones(2), covariance_m2=np.eye(2))
+        files.note(belief, state)
+        if second == 1:
+            with (tmp_path / "processes" / "leader.beliefs").open("ab") as stream:
+                stream.write(b"half")
+    data = (tmp_path / "processes" / "leader.beliefs").read_bytes()
+    times_s = np.frombuffer(data, dtype="<f8").reshape(4, -1)[:, 0]
+    assert times_s.tolist() == [0.0, 1.0, 2.0, 3.0]

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from host_tools.cli import main
+from host_tools.commands import status_of
 from protocol.codec import encode
 from protocol.packets import Answer, Header, Profile, SubmapPacket
 
@@ -168,3 +169,13 @@ def test_inspect_refuses_what_is_no_file_of_frames(
         path.write_bytes(content)
     assert main(["inspect", str(path)]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_an_error_of_the_system_without_a_file_is_one_line(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def full() -> None:
+        raise OSError("no space left")
+
+    assert status_of("benchmarks.days", full) == 2
+    assert capsys.readouterr().err == "benchmarks.days: no space left\n"

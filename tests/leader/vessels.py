@@ -1,5 +1,6 @@
 """Two or more cores over a small made-up relief and a perfect, simple water."""
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,8 +15,8 @@ from firmware.leader.core import LeaderCore
 from firmware.leader.settings import LeaderSettings
 from firmware.soundings import Odometry, Ping
 from firmware.submap_builder import SubmapSettings
-from protocol.codec import decode
-from protocol.packets import Packet
+from protocol.codec import decode, encode
+from protocol.packets import Header, Packet, Profile, TrajectoryPacket
 from protocol.schedule import Slots, SlotSettings
 from protocol.settings import replace
 
@@ -171,3 +172,44 @@ def convoy(
         },
         lose=lose,
     )
+
+
+def sailed(until_s: float = 100.0) -> LeaderCore:
+    """Return a leader that has surveyed alone."""
+    path = line(0.0, 0.0)
+    alone = Convoy(leader=leader_of(path), leader_path=path, followers={})
+    return alone.run(0.0, until_s).leader
+
+
+def sheets_of(leader: LeaderCore, vehicle: int = 1) -> list[tuple[int, int]]:
+    """Return boot and number of each sub-map of a vehicle that the leader holds."""
+    return sorted((s.id.boot_epoch, s.id.submap) for s in leader.atlas if s.id.vehicle == vehicle)
+
+
+def changed(frame: bytes, **changes: object) -> bytes:
+    """Return a frame with other values in its header."""
+    packet = decode(frame)
+    header = dataclasses.replace(packet.header, **changes)  # type: ignore[arg-type]
+    return encode(dataclasses.replace(packet, header=header))
+
+
+def trajectory(states: np.ndarray, first_s: float, *, vehicle: int = 1) -> bytes:
+    """Return a trajectory packet of states (T, 3), one a second from first_s."""
+    header = Header(
+        profile=Profile.TRAJECTORY,
+        vehicle=vehicle,
+        boot_epoch=0,
+        submap=1,
+        fragment=0,
+        fragment_count=1,
+        tx_second=0,
+        time_quarters=round(4 * first_s) % (1 << 20),
+    )
+    rows = np.full((20, 3), np.nan, dtype=np.float32)
+    rows[: len(states)] = states
+    return encode(TrajectoryPacket(header=header, states=rows))
+
+
+def walked(count: int, north_m: float) -> np.ndarray:
+    """Return states (count, 3) of a walk north."""
+    return np.column_stack([north_m + 2.0 * np.arange(count), np.zeros(count), np.zeros(count)])

@@ -1,0 +1,147 @@
+"""A follower's boots as its leader tells them apart: restarts, late frames, jumps, clocks."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from protocol.codec import decode
+from tests.leader.vessels import (
+    changed,
+    convoy,
+    follower_of,
+    sailed,
+    sheets_of,
+    trajectory,
+    walked,
+)
+
+
+def test_restarted_follower_goes_on_as_a_new_chain_tied_loosely_to_the_old() -> None:
+    one = convoy().run(0.0, 100.0)
+    old, old_track = sheets_of(one.leader), one.leader.track(1)
+    path = one.followers[1][1]  # dead reckoning begins anew, somewhere else
+    begun_anew = follower_of(path, boot_epoch=1, at_s=110.0, off_m=(200.0, -500.0))
+    one.followers[1] = (begun_anew, path)
+    one.run(110.0, 210.0)
+    sheets = sheets_of(one.leader)
+    assert set(old) <= set(sheets)
+    assert (1, 0) in sheets
+    assert one.leader.vehicles() == [0, 1]
+    assert len(one.leader.track(1).time_s) > len(old_track.time_s)
+    assert one.leader.status()["restarts"] == 1
+    link_m2 = one.leader.graph.covariance([one.leader.anchor(1, 120.0)])
+    assert 3.0 < np.sqrt(link_m2[0, 0]) < 200.0
+    here_m = one.leader.graph.position(one.leader.anchor(1, 120.0))
+    was_m = one.leader.graph.position(one.leader.anchor(1, 80.0))
+    assert np.hypot(*(here_m - was_m)) < 250.0
+
+
+def test_restart_with_dead_reckoning_unbroken_keeps_a_tight_link() -> None:
+    one = convoy().run(0.0, 100.0)
+    path = one.followers[1][1]
+    one.followers[1] = (follower_of(path, boot_epoch=1, at_s=110.0), path)
+    one.run(110.0, 200.0)
+    link_m2 = one.leader.graph.covariance([one.leader.anchor(1, 120.0)])
+    assert np.sqrt(link_m2[0, 0]) < 30.0
+
+
+@pytest.mark.parametrize("last_s", range(162, 182, 4))
+def test_restart_is_tied_to_the_old_chain_whenever_it_comes(last_s: int) -> None:
+    leader = sailed(100.0)
+    for time_s in range(101, 400):
+        leader.fleet.own.add(float(time_s), 2.0 * time_s, 0.0, 0.0)
+    for boot, times_s in ((0, range(106, last_s, 4)), (1, range(last_s + 10, last_s + 70, 4))):
+        for first_s in times_s:  # slices of four seconds, as the paper's frames carry them
+            header = decode(trajectory(walked(4, 0.0), float(first_s))).header
+            leader._arrivals._receive_states(
+                dataclasses.replace(header, boot_epoch=boot),
+                float(first_s),
+                walked(4, 2.0 * first_s),
+                first_s + 44.0,
+            )
+    assert leader.status()["restarts"] == 1
+    assert leader.status().get("restarts_untied", 0) == 0
+
+
+def test_restarts_beyond_the_header_s_four_bits_are_still_told_apart() -> None:
+    leader = sailed(40.0)
+    for boot in range(20):
+        frame = changed(
+            trajectory(walked(20, 300.0 * (boot % 2)), 20.0 * boot), boot_epoch=boot % 16
+        )
+        leader.receive_frame(frame, None, 20.0 * boot + 20.0)
+    assert leader.status()["restarts"] == 19
+    assert len(leader.graph.vehicles()) == 21
+    assert leader.vehicles() == [0, 1]
+
+
+def test_late_frame_of_an_earlier_boot_does_not_start_another() -> None:
+    leader = sailed(40.0)
+    for boot, first_s in ((0, 20.0), (1, 60.0), (0, 40.0), (1, 80.0)):
+        leader.receive_frame(
+            changed(trajectory(walked(20, 2.0 * first_s), first_s), boot_epoch=boot), None, 100.0
+        )
+    assert leader.status()["restarts"] == 1
+    assert len(leader.track(1).time_s) == 80
+
+
+def test_late_frame_of_a_boot_never_heard_does_not_start_another() -> None:
+    leader = sailed(40.0)
+    for boot, first_s in ((1, 60.0), (0, 20.0), (1, 80.0)):
+        leader.receive_frame(
+            changed(trajectory(walked(20, 2.0 * first_s), first_s), boot_epoch=boot), None, 100.0
+        )
+    assert leader.status().get("restarts", 0) == 0
+    assert len(leader.graph.vehicles()) == 3
+    assert leader.track(1).time_s == pytest.approx([*range(20, 40), *range(60, 100)])
+
+
+def test_trajectory_that_jumps_for_a_moment_loses_those_states_alone() -> None:
+    leader = sailed()
+    states = walked(20, 0.0)
+    states[7:10, 0] += 5000.0
+    leader.receive_frame(trajectory(states, 60.0), None, 100.0)
+    assert leader.status()["states_that_jump"] == 3
+    assert len(leader.track(1).time_s) == 17
+
+
+def test_trajectory_that_jumps_for_good_goes_on_as_a_new_chain() -> None:
+    leader = sailed()
+    leader.receive_frame(trajectory(walked(20, 0.0), 20.0), None, 100.0)
+    for k in range(3):
+        leader.receive_frame(trajectory(walked(20, 5000.0 + 40.0 * k), 40.0 + 20 * k), None, 100.0)
+    assert leader.status()["lasting_jumps"] == 1
+    assert leader.track(1).north_m.max() > 5000.0
+    assert leader.vehicles() == [0, 1]
+
+
+def test_lasting_jump_is_found_in_packets_that_overlap() -> None:
+    leader = sailed()
+    for first_s in range(0, 80, 4):
+        states = walked(20, 2.0 * first_s)
+        states[np.arange(first_s, first_s + 20) >= 40, 0] += 500.0
+        leader.receive_frame(trajectory(states, float(first_s)), None, 100.0)
+    assert leader.status()["lasting_jumps"] == 1
+    assert leader.track(1).north_m.max() > 500.0
+
+
+def test_lasting_jump_at_the_end_of_a_packet_silences_nobody() -> None:
+    leader = sailed()
+    for first_s in (0.0, 20.0, 40.0):
+        leader.receive_frame(trajectory(walked(20, 2.0 * first_s), first_s), None, 100.0)
+    states = walked(40, 120.0)
+    states[10:, 0] += 500.0
+    header = decode(trajectory(walked(20, 0.0), 60.0)).header
+    leader._arrivals._receive_states(header, 60.0, states, 104.0)
+    assert leader.status()["lasting_jumps"] == 1
+    assert leader.poll(111.0) is not None
+
+
+def test_follower_whose_clock_is_set_back_is_heard_again() -> None:
+    leader = sailed()
+    for now_s in range(20, 300, 20):
+        theirs_s = now_s - (60.0 if now_s >= 100 else 20.0)
+        leader.receive_frame(trajectory(walked(20, 2.0 * now_s), theirs_s), None, float(now_s))
+    assert leader.track(1).time_s[-1] >= 239.0
+    assert leader.vehicles() == [0, 1]

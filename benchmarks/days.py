@@ -26,10 +26,10 @@ from host_tools.commands import add_mission_arguments, settings_of, status_of
 from host_tools.mission import deployed, run, simulated_vehicles, water_between
 from host_tools.mission_settings import MissionSettings, changed
 from host_tools.nodes import BeliefLog
-from host_tools.processes.records import name_of
 from host_tools.simulator.placement import place_survey
 from host_tools.simulator.terrain import open_terrain
 from host_tools.simulator.vehicle import SimulatedVehicle
+from protocol.vehicles import name_of
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt

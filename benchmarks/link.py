@@ -17,8 +17,8 @@ from protocol.reassembly import Reassembler, ReassemblySettings, SubmapTransfer
 from protocol.repeats import FragmentQueue, RepeatSettings
 from protocol.schedule import Slots, SlotSettings
 from protocol.timestamps import to_quarters, to_tx_second, transmission_s
+from protocol.vehicles import LEADER
 
-LEADER = 0
 SUBMAP_S = 40
 
 

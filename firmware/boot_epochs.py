@@ -3,7 +3,8 @@
 import os
 from pathlib import Path
 
-BOOT_EPOCHS = 16  # the header has 4 bits for it
+from protocol.vehicles import BOOT_EPOCHS
+
 LIFE_S = 40.0
 """A life that is shorter has sent no sub-map: lives that no disk counts are told apart by this."""
 

@@ -18,10 +18,11 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from firmware.boot_epochs import BOOT_EPOCHS, EpochFile, uncounted_epoch
+from firmware.boot_epochs import EpochFile, uncounted_epoch
 from firmware.store_file import StoreFile, StoreUnusableError, is_about_access
 from protocol.errors import ConfigError
 from protocol.settings import Settings, setting
+from protocol.vehicles import BOOT_EPOCHS, name_of
 
 LOG = logging.getLogger(__name__)
 REPLAYS_TRIED = 5
@@ -55,7 +56,7 @@ class Owner:
     @property
     def name(self) -> str:
         """The vehicle's name in files."""
-        return "leader" if self.vehicle == 0 else f"follower_{self.vehicle}"
+        return name_of(self.vehicle)
 
 
 class Journal:

@@ -9,6 +9,7 @@ from host_tools.scenario import ScenarioSettings
 from host_tools.simulator.placement import Site
 from host_tools.simulator.vehicle import TrueTrack
 from protocol.acoustics import Delivery
+from protocol.vehicles import name_of
 
 STAGES = ("detected", "gated", "consistent")
 Counters = Mapping[str, float]
@@ -35,7 +36,7 @@ class VehicleResult:
     @property
     def name(self) -> str:
         """The name in files: leader, follower_1, ..."""
-        return "leader" if self.vehicle == 0 else f"follower_{self.vehicle}"
+        return name_of(self.vehicle)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -5,9 +5,12 @@ from dataclasses import dataclass
 
 from protocol.errors import ConfigError
 from protocol.settings import Settings, setting
+from protocol.vehicles import LEADER
 
 CLOCK_TOLERANCE_S = 1e-6
 """A slot that began this short a while ago still counts as now; far below any bit."""
+
+_PAST_S = 1e-3  # after a slot's beginning, its next one is looked for
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,25 +63,55 @@ class Slots:
 
     def next_slot_s(self, vehicle: int, now_s: float) -> float:
         """Return the next slot of the leader (vehicle 0) or of a follower (1 and up)."""
-        if vehicle == 0:
+        if vehicle == LEADER:
             return self.next_leader_slot_s(now_s)
         return self.next_follower_slot_s(now_s, vehicle)
-
-    def is_between(self, vehicle: int, next_slot_s: float, now_s: float) -> bool:
-        """Return whether a vehicle's next slot, told before, has yet to come.
-
-        One that lies farther ahead than slots lie apart was told before the clock was set back.
-        """
-        settings = self.settings
-        turn_s = settings.follower_slot_s * settings.followers
-        apart_s = settings.leader_period_s if vehicle == 0 else turn_s
-        return CLOCK_TOLERANCE_S < next_slot_s - now_s <= apart_s + CLOCK_TOLERANCE_S
 
     def frames_per_submap(self, submap_s: float) -> int:
         """Return how many frames one follower may send while a sub-map is measured."""
         settings = self.settings
         slots = int(submap_s // (settings.follower_slot_s * settings.followers))
         return slots * settings.frames_per_slot
+
+
+class Turns:
+    """One vehicle's slots as they come, and how many of them it missed."""
+
+    def __init__(self, slots: Slots, vehicle: int, start_s: float) -> None:
+        settings = slots.settings
+        self.missed = 0
+        self._slots, self._vehicle = slots, vehicle
+        is_leader = vehicle == LEADER
+        self._frames = 1 if is_leader else settings.frames_per_slot
+        turn_s = settings.follower_slot_s * settings.followers
+        self._apart_s = settings.leader_period_s if is_leader else turn_s
+        self._next_s = start_s
+        self.skip(start_s - _PAST_S)
+
+    def due_s(self, now_s: float) -> float | None:
+        """Return the slot that begins now, once for each frame that it holds, or else None."""
+        if self._is_ahead(now_s):
+            return None
+        slot_s = self._slots.next_slot_s(self._vehicle, now_s)
+        is_late = slot_s > now_s + CLOCK_TOLERANCE_S
+        self.missed += is_late
+        self._left -= 1
+        if is_late or self._left <= 0:
+            self.skip(now_s)
+        return None if is_late else slot_s
+
+    def skip(self, now_s: float) -> None:
+        """Leave what is left of a slot that begins now: there is nothing to send."""
+        self._next_s = self._slots.next_slot_s(self._vehicle, now_s + _PAST_S)
+        self._left = self._frames
+
+    def _is_ahead(self, now_s: float) -> bool:
+        """Return whether the next slot, found before, has yet to come.
+
+        One that lies farther ahead than slots lie apart was found before the clock was set back.
+        """
+        ahead_s = self._next_s - now_s
+        return CLOCK_TOLERANCE_S < ahead_s <= self._apart_s + CLOCK_TOLERANCE_S
 
 
 def _next_in_raster(now_s: float, period_s: float, offset_s: float) -> float:

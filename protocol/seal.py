@@ -16,6 +16,7 @@ from typing import Protocol
 from protocol.codec import decode_body, encode, encode_body, encode_header
 from protocol.errors import LocalProtocolError, RemoteProtocolError
 from protocol.packets import Header, Packet, Profile, SealedFrame
+from protocol.vehicles import LEADER
 
 TAG_BYTES = 8
 """One forgery in 30 days at a frame a second has a chance of 1e-13."""
@@ -23,7 +24,6 @@ KEY_BYTES = 32
 WINDOW = 64
 """Counters behind the newest that are still told apart, far more than the water can reorder."""
 LARGEST_COUNTER = 2**32 - 1
-LEADER = 0
 _ANSWERS = (Profile.ANSWER, Profile.ANSWER_EXTENDED)
 
 

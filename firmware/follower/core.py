@@ -28,8 +28,9 @@ from protocol.errors import (
     RemoteProtocolError,
 )
 from protocol.packets import Answer, ExtendedAnswer, SealedFrame
-from protocol.schedule import Slots
+from protocol.schedule import Slots, Turns
 from protocol.timestamps import from_quarters, to_quarters, transmission_s
+from protocol.vehicles import LEADER
 
 _IDLE_STATES = 20  # as many as a trajectory packet holds
 _LONGEST_AIRTIME_S = 5.0
@@ -56,7 +57,7 @@ class FollowerCore:
         settings: FollowerSettings,
         slots: Slots,
     ) -> None:
-        if vehicle == 0:
+        if vehicle == LEADER:
             raise ConfigError("vehicle 0 is the leader; a follower's number is 1 or higher")
         self.vehicle, self.boot_epoch = vehicle, boot_epoch
         self.counters: Counter[str] = Counter()
@@ -76,8 +77,7 @@ class FollowerCore:
         self._outbox = Outbox(
             vehicle, boot_epoch, settings.repeats, small_frames=self._compression.small_frames
         )
-        self._next_slot_s = slots.next_slot_s(vehicle, start.time_s)
-        self._frames_left = slots.settings.frames_per_slot
+        self._turns = Turns(slots, vehicle, start.time_s)
         self._last_submap_s = start.time_s
 
     def receive_odometry(self, odometry: Odometry) -> None:
@@ -102,7 +102,7 @@ class FollowerCore:
             self.counters["frames_rejected"] += 1
             self.counters[f"rejected_{error.cause}"] += 1
             return
-        if not isinstance(packet, Answer | ExtendedAnswer) or packet.header.vehicle != 0:
+        if not isinstance(packet, Answer | ExtendedAnswer) or packet.header.vehicle != LEADER:
             self.counters["frames_not_for_us"] += 1
             self.counters["frames_with_our_number"] += packet.header.vehicle == self.vehicle
             self.counters["frames_sealed"] += isinstance(packet, SealedFrame)
@@ -128,20 +128,12 @@ class FollowerCore:
 
     def poll(self, now_s: float) -> bytes | None:
         """Return a frame to transmit now, or None; as many a slot as it holds, one each call."""
-        if self._slots.is_between(self.vehicle, self._next_slot_s, now_s):
+        slot_s = self._turns.due_s(now_s)
+        if slot_s is None:
             return None
-        slot_s = self._slots.next_slot_s(self.vehicle, now_s)
-        on_time = abs(slot_s - now_s) < 1e-6
-        packet = None
-        if on_time:
-            self._frames_left -= 1
-            packet = self._outbox.next_packet(slot_s, self._slots_left(slot_s), self._idle_states())
-        else:
-            self.counters["slots_missed"] += 1
-        if packet is None or self._frames_left <= 0:
-            self._next_slot_s = self._slots.next_slot_s(self.vehicle, now_s + 1e-3)
-            self._frames_left = self._slots.settings.frames_per_slot
+        packet = self._outbox.next_packet(slot_s, self._slots_left(slot_s), self._idle_states())
         if packet is None:
+            self._turns.skip(now_s)
             return None
         self.counters["frames_sent"] += 1
         return encode(packet)
@@ -162,6 +154,7 @@ class FollowerCore:
         return {
             **self.counters,
             **self._outbox.status(),
+            "slots_missed": self._turns.missed,
             "bad_odometry": self._reckoning.bad_samples,
             "bad_beams": self._builder.bad_beams,
             "bad_pings": self._builder.bad_pings,

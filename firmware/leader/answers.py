@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware.belief import Belief
-from firmware.leader.atlas import LEADER
 from firmware.leader.fleet import Fleet
 from firmware.leader.pose_graph import PoseGraph
 from protocol.errors import EstimationError
 from protocol.packets import Answer, ExtendedAnswer, Header, Profile, answer_count
 from protocol.reassembly import Reassembler
 from protocol.timestamps import to_quarters, to_tx_second
+from protocol.vehicles import LEADER
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

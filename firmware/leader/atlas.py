@@ -12,10 +12,7 @@ from firmware.leader.shelf import MemoryShelf, Shelf, packed, unpacked
 from firmware.leader.trajectory import Trajectory
 from firmware.leader.warping import remove_drift
 from firmware.submaps import GriddedSubmap, Track
-
-LEADER = 0
-BOOT_EPOCHS = 16
-"""The header has four bits each for the vehicle and its boot epoch."""
+from protocol.vehicles import BOOT_EPOCHS, LEADER
 
 FOOTPRINT_M = 10.0
 """Tiles in which footprints are compared: a tenth of a sub-map."""
@@ -29,11 +26,6 @@ def chain_of(vehicle: int, boot: int) -> int:
 def vehicle_of(chain: int) -> int:
     """Return the vehicle whose chain it is."""
     return chain % BOOT_EPOCHS
-
-
-def name_of(vehicle: int) -> str:
-    """Return a vehicle's name in text."""
-    return "leader" if vehicle == LEADER else f"follower {vehicle}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

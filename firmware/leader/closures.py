@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from firmware.geometry import Array
+from firmware.geometry import Array, offset_covariance
 from firmware.leader.atlas import SheetId
 from firmware.leader.closure_settings import ClosureSettings
 from firmware.leader.displacement import displaced
@@ -114,11 +114,10 @@ def gated(closures: list[Closure], graph: PoseGraph, settings: ClosureSettings) 
         return []
     anchors = [anchor for c in closures for anchor in (c.origin_anchor, c.target_anchor)]
     joint_m2 = graph.covariance(anchors)
-    between = np.hstack([-np.eye(2), np.eye(2)])
     passed = []
     for k, closure in enumerate(closures):
         ends = slice(4 * k, 4 * k + 4)
-        prior_m2 = between @ joint_m2[ends, ends] @ between.T
+        prior_m2 = offset_covariance(joint_m2[ends, ends])
         spread_m2 = prior_m2 + closure.covariance_m2
         predicted_m = graph.offset(closure.origin_anchor, closure.target_anchor)
         innovation_m = closure.offset_m - predicted_m

@@ -15,7 +15,7 @@ from firmware.belief import Belief
 from firmware.dead_reckoning import DeadReckoning, ReckonedState
 from firmware.leader.answers import Answers
 from firmware.leader.arrivals import Arrivals, Rebuild
-from firmware.leader.atlas import LEADER, Atlas, Sheet, SheetId, sheet_of
+from firmware.leader.atlas import Atlas, Sheet, SheetId, sheet_of
 from firmware.leader.closure_log import Verdict
 from firmware.leader.composition import detail_from_s
 from firmware.leader.coverage import redundant
@@ -39,7 +39,8 @@ from protocol.codec import decode, encode
 from protocol.errors import RemoteProtocolError
 from protocol.packets import SealedFrame, SubmapFragment, SubmapPacket, TrajectoryPacket
 from protocol.reassembly import Reassembler
-from protocol.schedule import Slots
+from protocol.schedule import Slots, Turns
+from protocol.vehicles import LEADER
 
 _AHEAD_S = 1.0  # of our clock: an arrival later than that is a modem's error
 
@@ -93,7 +94,7 @@ class LeaderCore:
         noise_m2 = settings.matching.cell_sigma_m**2
         self.outlook = Outlook(self.fleet, self.graph, self.atlas, settings.manoeuvre, noise_m2)
         self.composed_s = start.time_s
-        self._next_slot_s = slots.next_slot_s(LEADER, start.time_s)
+        self._turns = Turns(slots, LEADER, start.time_s)
         start_m = np.array([start.north_m, start.east_m])
         self.graph.add_vehicle(LEADER, start.time_s, start_m, start_m)
 
@@ -171,12 +172,7 @@ class LeaderCore:
 
     def poll(self, now_s: float) -> bytes | None:
         """Return the answer to transmit now, or None; followers take turns."""
-        if self._slots.is_between(LEADER, self._next_slot_s, now_s):
-            return None
-        slot_s = self._slots.next_slot_s(LEADER, now_s)
-        self._next_slot_s = self._slots.next_slot_s(LEADER, now_s + 1e-3)
-        if slot_s > now_s + 1e-6:
-            self.counters["slots_missed"] += 1
+        if self._turns.due_s(now_s) is None:
             return None
         answer = self._answers.next_answer(self.belief(), self._reassembler, now_s)
         return None if answer is None else encode(answer)
@@ -236,6 +232,7 @@ class LeaderCore:
                 f"reassembly_{k}": v
                 for k, v in dataclasses.asdict(self._reassembler.counters).items()
             },
+            "slots_missed": self._turns.missed,
             "bad_odometry": self._reckoning.bad_samples,
             "bad_beams": self._builder.bad_beams,
             "bad_pings": self._builder.bad_pings,

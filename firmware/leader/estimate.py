@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from firmware.geometry import Array
+from firmware.geometry import Array, offset_covariance
 from firmware.leader.chains import Chain
 from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.ledger import (
@@ -239,12 +239,9 @@ class Estimate:
         """Return the covariance (2, 2) of the way between each node and its owner."""
         keys = list(dict.fromkeys([*owners, *owners.values()]))
         joint_m2 = self._joint_covariance(keys) if keys else np.zeros((0, 0))
-        rows = {key: slice(2 * k, 2 * k + 2) for k, key in enumerate(keys)}
-        apart_m2 = {}
-        for key, owner in owners.items():
-            a, b = rows[key], rows[owner]
-            apart_m2[key] = joint_m2[a, a] + joint_m2[b, b] - joint_m2[a, b] - joint_m2[b, a]
-        return apart_m2
+        rows = {key: (2 * k, 2 * k + 1) for k, key in enumerate(keys)}
+        ends = {key: (*rows[key], *rows[owner]) for key, owner in owners.items()}
+        return {key: offset_covariance(joint_m2[np.ix_(both, both)]) for key, both in ends.items()}
 
     def _state(self, key: int) -> Array:
         return self._solver.state(key)

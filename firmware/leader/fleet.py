@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware.geometry import Array
-from firmware.leader.atlas import BOOT_EPOCHS, LEADER, chain_of, vehicle_of
+from firmware.leader.atlas import chain_of, vehicle_of
 from firmware.leader.pose_graph import PoseGraph
 from firmware.leader.ranging import Ranging
 from firmware.leader.tracks import TrackBuffer
@@ -23,6 +23,7 @@ from protocol.errors import EstimationError
 from protocol.packets import Header, usable_states
 from protocol.settings import Settings, setting
 from protocol.timestamps import from_quarters
+from protocol.vehicles import BOOT_EPOCHS, LEADER
 
 _CONTINUES_M = 3.0  # dead reckoning that goes on lies this near to a straight continuation
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from firmware.geometry import Array
-from firmware.leader.atlas import Atlas, Sheet, name_of
+from firmware.leader.atlas import Atlas, Sheet
 from firmware.leader.estimate import Estimate
 from firmware.leader.fleet import Fleet
 from firmware.leader.manoeuvre import (
@@ -18,6 +18,7 @@ from firmware.leader.observability import Observability, observe
 from firmware.leader.offsets import anchor_of, corrections
 from firmware.submaps import GriddedSubmap
 from protocol.errors import EstimationError
+from protocol.vehicles import name_of
 
 MOST_GROUND = 32  # sub-maps whose joint covariance is asked for
 APART_M = 60.0  # nearer ones tell the same

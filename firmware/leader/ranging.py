@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from firmware.geometry import offset_covariance
 from firmware.leader.ledger import Anchor
 from firmware.leader.pose_graph import PoseGraph
 from firmware.leader.ranges import RangeJudge, RangeSettings, RangeVerdict
@@ -268,8 +269,7 @@ def _spread(placed: _PlacedRange, graph: PoseGraph) -> tuple[float, float]:
     that is as large as the range's noise, a linear filter chooses one side of the line and grows
     sure of it, though the mirror image fits as well.
     """
-    between = np.hstack([-np.eye(2), np.eye(2)])
-    covariance_m2 = between @ graph.covariance([placed.here, placed.there]) @ between.T
+    covariance_m2 = offset_covariance(graph.covariance([placed.here, placed.there]))
     along, across = placed.direction, np.array([-placed.direction[1], placed.direction[0]])
     along_m2 = float(along @ covariance_m2 @ along) + placed.clock_sigma_m**2
     bent_m = float(across @ covariance_m2 @ across) / (np.sqrt(2.0) * placed.predicted_m + 1e-3)

@@ -18,6 +18,7 @@ from host_tools.processes.served_clock import CLOCK_SCHEME
 from protocol.acoustics import Water
 from protocol.errors import ConfigError, RemoteProtocolError
 from protocol.modems.serial_line import DEFAULT_BAUD
+from protocol.vehicles import name_of
 
 WAIT_S = 0.2
 """Of real time, between two looks at what else may have happened."""
@@ -133,7 +134,7 @@ class Fleet:
 
     def _node(self, vehicle: int) -> RemoteNode:
         baud = DEFAULT_BAUD if self._modems is None else self._modems.baud
-        port = PseudoPort(baud, self.folder / _port_name(vehicle))
+        port = PseudoPort(baud, self.folder / name_of(vehicle).replace("_", "-"))
         drives = (self.advance, self.until_answered)
         if self._modems is not None:
             return ModemNode(vehicle, port, *drives, self._modems.bench.units[vehicle])
@@ -213,7 +214,3 @@ class Fleet:
                 self._ended.add(node.vehicle)
         if not line.is_open:
             node.leave()
-
-
-def _port_name(vehicle: int) -> str:
-    return "leader" if vehicle == 0 else f"follower-{vehicle}"

@@ -23,16 +23,12 @@ from host_tools.mapping import DepthMap
 from host_tools.nodes import ROW_NUMBERS, belief_columns, belief_row
 from host_tools.results import ClosureResult, Counters, SoundingPatch
 from protocol.errors import ConfigError
+from protocol.vehicles import name_of
 
 FOLDER = "processes"
 _ROW_BYTES = 8 * ROW_NUMBERS
 _PATCH = ("north_m", "east_m", "depth_m", "variance_m2", "time_s")
 _TRAJECTORY = tuple(field.name for field in dataclasses.fields(Trajectory))
-
-
-def name_of(vehicle: int) -> str:
-    """Return the vehicle's name in files."""
-    return "leader" if vehicle == 0 else f"follower_{vehicle}"
 
 
 class VehicleFiles:

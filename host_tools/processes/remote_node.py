@@ -11,6 +11,7 @@ from host_tools.processes.control import Advance, Arrival, ControlLine, Done
 from protocol.crc import crc32c
 from protocol.framing import LineReader, wrap
 from protocol.modems.base import QUEUED_EVENTS, QUEUED_FRAMES
+from protocol.vehicles import name_of
 
 HANDOVER_S = 2.0
 """Of real time: a kernel that has not passed bytes on by then has lost them."""
@@ -62,7 +63,7 @@ class RemoteNode:
     @property
     def name(self) -> str:
         """The vehicle's name in messages and files."""
-        return "leader" if self.vehicle == 0 else f"follower_{self.vehicle}"
+        return name_of(self.vehicle)
 
     def hear(self, frame: bytes, toa_s: float | None, now_s: float) -> None:
         """Take a frame from the water; it goes over the line with the next period."""

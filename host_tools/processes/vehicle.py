@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware.boot_epochs import BOOT_EPOCHS, LIFE_S
+from firmware.boot_epochs import LIFE_S
 from firmware.clock import WallClock
 from firmware.follower.core import FollowerCore
 from firmware.follower.loop import FollowerLoop
@@ -49,9 +49,9 @@ from protocol.modems.dialect_driver import DialectDriver, await_identified, chec
 from protocol.modems.registry import open_modem
 from protocol.modems.sealed import SealedLink, SealedModem
 from protocol.packets import FRAME_BYTES, SMALL_FRAME_BYTES
+from protocol.vehicles import BOOT_EPOCHS, LEADER
 
 LOG = logging.getLogger(__name__)
-LEADER = 0
 STATUS_S = 60.0
 WALL = "wall"
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from protocol.acoustics import Water, WaterSettings
 from protocol.errors import ConfigError
-from protocol.schedule import Air, Slots, SlotSettings, conflict_free_reach_m, planned_slots
+from protocol.schedule import Air, Slots, SlotSettings, Turns, conflict_free_reach_m, planned_slots
 from protocol.timestamps import (
     from_quarters,
     one_way_travel_time_s,
@@ -46,11 +46,26 @@ def test_the_next_slot_is_never_in_the_past(now_s: float, vehicle: int) -> None:
 @pytest.mark.parametrize("vehicle", [0, 3])
 def test_a_slot_minutes_ahead_has_yet_to_come_unless_the_clock_was_set_back(vehicle: int) -> None:
     slots = Slots(SlotSettings(followers=14, follower_slot_s=10, leader_period_s=140))
+    turns = Turns(slots, vehicle, 1000.0)
     next_s = slots.next_slot_s(vehicle, 1000.0)
     after_s = slots.next_slot_s(vehicle, next_s + 1e-3)
-    assert slots.is_between(vehicle, after_s, next_s + 1.0)
-    assert not slots.is_between(vehicle, after_s, after_s)
-    assert not slots.is_between(vehicle, after_s, after_s - 500.0)
+    assert [turns.due_s(now_s) for now_s in (next_s, next_s + 1.0, after_s)] == [
+        next_s,
+        None,
+        after_s,
+    ]
+    assert turns.missed == 0
+    set_back_s = slots.next_slot_s(vehicle, 500.0)
+    assert turns.due_s(set_back_s) == set_back_s
+
+
+def test_a_slot_is_missed_a_little_late_and_holds_as_many_frames_as_it_may() -> None:
+    turns = Turns(Slots(SlotSettings(frames_per_slot=2)), 1, 0.0)
+    assert [turns.due_s(0.0) for _ in range(3)] == [0.0, 0.0, None]
+    assert (turns.due_s(4.5), turns.missed) == (None, 1)
+    assert turns.due_s(8.0) == 8.0
+    turns.skip(8.0)
+    assert turns.due_s(8.0) is None
 
 
 def test_slots_that_cannot_be_are_refused() -> None:

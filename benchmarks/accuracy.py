@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from host_tools.commands import add_mission_arguments, settings_of, status_of
+from host_tools.commands import add_mission_arguments, count, settings_of, status_of
 from host_tools.evaluation import Evaluation, JudgedClosure, evaluate
 from host_tools.simulate import simulate
 
@@ -96,7 +96,7 @@ def main() -> None:
     """Run the missions and print the table."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.accuracy", description=__doc__)
     add_mission_arguments(parser)
-    parser.add_argument("--seeds", type=int, default=5, help="seeds 1 to N")
+    parser.add_argument("--seeds", type=count, default=5, help="seeds 1 to N")
     arguments = parser.parse_args()
     settings, runs = settings_of(arguments), []
     for seed in range(1, arguments.seeds + 1):

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from host_tools.commands import add_mission_arguments, status_of
+from host_tools.commands import add_mission_arguments, count, status_of
 from host_tools.processes.demo import run_demo
 from host_tools.processes.emulated_modems import MODEMS
 from host_tools.processes.voyage import Voyage, voyage_of
@@ -49,7 +49,7 @@ def main() -> None:
     """Run the missions and print the table."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.modems", description=__doc__)
     add_mission_arguments(parser)
-    parser.add_argument("--seeds", type=int, default=3, help="seeds 1 to N")
+    parser.add_argument("--seeds", type=count, default=3, help="seeds 1 to N")
     arguments = parser.parse_args()
     found: dict[str, list[np.ndarray]] = {link: [] for link in LINKS}
     for seed in range(1, arguments.seeds + 1):

@@ -14,7 +14,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from benchmarks.accuracy import Figures, figures
-from host_tools.commands import add_mission_arguments, settings_of, status_of
+from host_tools.commands import add_mission_arguments, count, settings_of, status_of
 from host_tools.evaluation import evaluate
 from host_tools.simulate import simulate
 
@@ -60,7 +60,7 @@ def main() -> None:
     """Run the missions and print a line for each loss and coder."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.navigation", description=__doc__)
     parser.add_argument("--terrain", type=Path, metavar="FILE")
-    parser.add_argument("--seeds", type=int, default=2, help="seeds 1 to N")
+    parser.add_argument("--seeds", type=count, default=2, help="seeds 1 to N")
     parser.add_argument("--loss", type=float, action="append", help="default: 0.14 and 0.3")
     parser.add_argument("--coder", action="append", help=f"default: {' '.join(_CODERS)}")
     arguments = parser.parse_args()

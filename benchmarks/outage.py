@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from host_tools.commands import add_mission_arguments, settings_of, status_of
+from host_tools.commands import add_mission_arguments, count, settings_of, status_of
 from host_tools.mission_settings import MissionSettings, changed
 from host_tools.simulate import simulate
 
@@ -48,7 +48,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.outage", description=__doc__)
     add_mission_arguments(parser)
     parser.set_defaults(scenario="day-1")
-    parser.add_argument("--seeds", type=int, default=3, help="seeds 1 to N")
+    parser.add_argument("--seeds", type=count, default=3, help="seeds 1 to N")
     arguments = parser.parse_args()
     undisturbed = changed(
         settings_of(arguments),

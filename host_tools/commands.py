@@ -126,6 +126,14 @@ def parse_changes(texts: Sequence[str]) -> dict[str, object]:
     return changes
 
 
+def count(text: str) -> int:
+    """Return the text as a number of something, 1 or more."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text} is none; give 1 or more")
+    return value
+
+
 def seed(text: str) -> int:
     """Return the text as a seed, 0 or more."""
     value = int(text)

@@ -36,7 +36,7 @@ def read_frames(path: Path) -> Iterator[tuple[str, Captured]]:
     Raises
     ------
     ConfigError
-        When the file cannot be read or holds no frame at all.
+        When the file cannot be read, or is no air.jsonl and holds no whole frame.
     """
     try:
         data = path.read_bytes()
@@ -47,7 +47,12 @@ def read_frames(path: Path) -> Iterator[tuple[str, Captured]]:
     if data.lstrip()[:1] == b"{":
         yield from _read_air(path, data)
     else:
-        for second, (offset, piece) in enumerate(_split(data)):
+        pieces = list(_split(data))
+        if not any(_decodes(piece) for _, piece in pieces):
+            raise ConfigError(
+                f"{path} holds no whole frame; give frames back to back, or an air.jsonl"
+            )
+        for second, (offset, piece) in enumerate(pieces):
             yield f"{offset:8d}", Captured(time_s=float(second), frame=piece)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from host_tools.commands import BASELINES, Command
+from host_tools.commands import BASELINES, Command, count
 from host_tools.evaluation import Evaluation, as_plain, closure_counts, evaluate
 from host_tools.matching_trial import PAIRS, TrialResult, run_trial, trial_lines
 from host_tools.mission_settings import MissionSettings, changed
@@ -18,7 +18,6 @@ from host_tools.simulate import simulate
 from host_tools.simulator.placement import place_survey
 from host_tools.simulator.terrain import open_terrain
 from host_tools.writers import prepare_folder
-from protocol.errors import ConfigError
 
 SCENARIOS = ("paper-1", "paper-2")
 # Mean live errors in metres, leader and follower (6.2); nothing is printed for the rest.
@@ -142,16 +141,16 @@ def _paper(scenario: str, baseline: str, vehicle: int) -> str:
 
 def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--terrain", type=Path, metavar="FILE", help="default: a built-in relief")
-    parser.add_argument("--seeds", type=int, default=5, metavar="N", help="seeds 1 to N; default 5")
     parser.add_argument(
-        "--pairs", type=int, default=PAIRS, metavar="N", help=f"of Figure 8; default {PAIRS}"
+        "--seeds", type=count, default=5, metavar="N", help="seeds 1 to N; default 5"
+    )
+    parser.add_argument(
+        "--pairs", type=count, default=PAIRS, metavar="N", help=f"of Figure 8; default {PAIRS}"
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="write the figures there as well")
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    if arguments.seeds < 1 or arguments.pairs < 1:
-        raise ConfigError("--seeds and --pairs must be at least 1")
     folder = None if arguments.out is None else prepare_folder(arguments.out)
     trial = _trial(arguments.terrain, arguments.pairs)
     lines = ["Section 6.1, Figure 8: closures between sub-maps", *trial_lines(trial), ""]

@@ -6,6 +6,7 @@ Every room declares its own settings beside the code that reads them; `firmware.
 """
 
 import dataclasses
+import difflib
 import types
 import typing
 from collections.abc import Iterator, Mapping
@@ -102,7 +103,10 @@ def _resolve(name: str, known: list[str], prefer: str) -> list[str]:
         return matches[0].split(".")
     if matches:
         raise ConfigError(f"setting {name!r} is ambiguous; write one of {', '.join(matches)}")
-    raise ConfigError(f"unknown setting {name!r}; `fathomlink config show` lists them all")
+    leaves = {key.rpartition(".")[2]: key for key in known}
+    near = difflib.get_close_matches(name.rpartition(".")[2], leaves, n=1)
+    meant = f"did you mean {leaves[near[0]]}? " if near else ""
+    raise ConfigError(f"unknown setting {name!r}; {meant}`fathomlink config show` lists them all")
 
 
 def _replace_one(settings: T, path: list[str], value: object) -> T:

@@ -3,13 +3,13 @@
 import argparse
 from functools import partial
 
-from host_tools.commands import Command
+from host_tools.commands import Command, count
 from host_tools.emulators.run import KINDS, EmulationSettings, emulate
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("kind", choices=KINDS, help="the dialect that the modems speak")
-    parser.add_argument("--nodes", type=int, default=2, help="how many modems")
+    parser.add_argument("--nodes", type=count, default=2, help="how many modems")
     parser.add_argument(
         "--range", type=float, default=500.0, metavar="M", help="metres between neighbours"
     )

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 from tqdm import tqdm
 
-from host_tools.commands import Command, seed
+from host_tools.commands import Command, count, seed
 from host_tools.faults.catalogue import Fault, Plan, plan_of
 from host_tools.faults.link_trial import FIRST_S, SPAN_S, link_trial
 from host_tools.faults.mission_trial import FIRST_S as MISSION_FIRST_S
@@ -104,7 +104,7 @@ def _one(trial: Trial, plan: Plan, number: int) -> Outcome:
 
 def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--tier", choices=("link", "mission"), default="link")
-    parser.add_argument("--seeds", type=int, default=1000, metavar="N", help="default: 1000")
+    parser.add_argument("--seeds", type=count, default=1000, metavar="N", help="default: 1000")
     parser.add_argument("--first", type=seed, default=0, metavar="N", help="first seed (default 0)")
     parser.add_argument("--seed", type=seed, metavar="N", help="this seed alone, with its faults")
 

@@ -86,6 +86,7 @@ def test_sound_profile_is_shown_as_it_is_set(
     [
         (["--scenario", "paper-9"], "choose one of paper-1, paper-2, field-1, day-1"),
         (["--set", "depth_of_field=3"], "unknown setting 'depth_of_field'"),
+        (["--set", "duratoin_min=3"], "did you mean scenario.duration_min?"),
         (["--set", "leg_m"], "is not KEY=VALUE"),
         (["--set", "leg_m=long"], "give a value of type float"),
         (["--loss", "1.5"], "must be at most 1"),
@@ -129,6 +130,15 @@ def test_inspect_describes_frames_and_steps_over_garbage(
     assert "submap 12 fragment 7/10" in lines[2]
     assert "15 points" in lines[2]
     assert "100 bytes that are no frame" in lines[3]
+
+
+def test_inspect_of_a_file_without_frames_says_what_to_give(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "notes.txt"
+    path.write_text("no frame is as short as this")
+    assert main(["inspect", str(path)]) == 2
+    assert "holds no whole frame; give frames back to back" in capsys.readouterr().err
 
 
 def test_inspect_reads_air_and_says_why_a_frame_is_dropped(

@@ -43,5 +43,7 @@ def test_scenarios_without_runs_are_left_out() -> None:
 def test_bad_counts_are_one_line_and_status_2(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["reproduce", "--seeds", "0", "--out", str(tmp_path)]) == 2
-    assert "at least 1" in capsys.readouterr().err
+    with pytest.raises(SystemExit) as stopped:
+        main(["reproduce", "--seeds", "0", "--out", str(tmp_path)])
+    assert stopped.value.code == 2
+    assert "argument --seeds: 0 is none; give 1 or more" in capsys.readouterr().err

@@ -1,9 +1,7 @@
 """What the leader's answers teach a follower about its own dead reckoning.
 
-The state is how far dead reckoning has run away and how fast, beside the errors of the leader's
-own estimates. An answer is one to two minutes old and the leader repeats and revises it: its error
-is not drawn anew each time, but wanders. It is therefore kept as a state of its own, in units of
-the answer's sigma, so that many answers do not count as much evidence. What came is kept in the
+The state is how far dead reckoning has run away and how fast. An answer is one to two minutes old,
+and holds what all answers before it held: only what is new in it counts. What came is kept in the
 order of its times and filtered again whenever something older arrives. Nothing here corrects dead
 reckoning itself.
 """
@@ -193,21 +191,16 @@ class DriftCorrection:
     def _news(self, time_s: float, ran_away_m: Array, sigma_m: float | None) -> AnswerSeen | None:
         """Return what an answer says beyond our own dead reckoning, or None if nothing.
 
-        A leader's estimate holds what any vehicle of this kind may drift, as this filter does;
-        that part is divided out of a variance that is told, lest it counts twice.
+        One that is no surer than our dead reckoning alone says nothing.
         """
         alone_m2 = self._alone_m2(time_s)
         if sigma_m is None:
             self._echo = self._is_echo(time_s, ran_away_m, alone_m2)
             sigma_m = self._settings.answer_sigma_m
-            return AnswerSeen(time_s=time_s, ran_away_m=ran_away_m, sigma_m=sigma_m)
-        kept = 1.0 - sigma_m**2 / alone_m2
-        if kept < _LEAST_NEWS:
+        elif sigma_m**2 > (1.0 - _LEAST_NEWS) * alone_m2:
             self.empty += 1
             return None
-        return AnswerSeen(
-            time_s=time_s, ran_away_m=ran_away_m / kept, sigma_m=sigma_m / float(np.sqrt(kept))
-        )
+        return AnswerSeen(time_s=time_s, ran_away_m=ran_away_m, sigma_m=sigma_m)
 
     def _alone_m2(self, time_s: float) -> float:
         """Return the variance of dead reckoning that nobody corrects, along one axis."""

@@ -1,8 +1,14 @@
 """A bank of Kalman filters over drift: how far dead reckoning ran away, how fast, and other errors.
 
-The state is (c, b, u, v), each with north and east: c in metres and b in metres a second are
-dead reckoning's; u is the error of the leader's answers and v that of its own position, both in
-units of the sigma that is told with them, each wandering with a correlation time.
+The state is (c, b, v), each with north and east: c in metres and b in metres a second are dead
+reckoning's; v is the error of the leader's own position, in units of the sigma that is told with
+it, wandering with a correlation time.
+
+An answer is an estimate, not a measurement: it holds all that the leader was ever told, and so all
+that earlier answers held. What is new in it is by how much it is surer than this filter; only that
+counts, however often it is said. Errors of two estimates of which the later holds what the earlier
+one held are correlated by the ratio of their sigmas: the difference of both has the difference of
+both variances.
 
 How much b wanders differs from sea to sea, and nobody knows it beforehand. Each filter of the bank
 takes another walk for granted, and has the weight that what was seen gives to it: multiple-model
@@ -36,12 +42,12 @@ class DriftSettings(Settings):
     walk_memory_s: float = setting(
         3600.0, "s", "in which what they told of it fades: tides turn", minimum=60.0
     )
-    answers_alike_s: float = setting(
-        150.0, "s", "errors of answers are alike for half a survey line, between closures",
+    leader_alike_s: float = setting(
+        150.0, "s", "the leader's errors are alike for half a survey line, between closures",
         minimum=1.0,
     )  # fmt: skip
     fresh_share: float = setting(
-        0.4, "1", "of an answer's sigma that is drawn anew each time", minimum=0.01, maximum=1.0
+        0.4, "1", "of a told sigma that is drawn anew each time", minimum=0.01, maximum=1.0
     )
     range_sigma_m: float = setting(1.5, "m", "noise of one range (Eq. 13) and slant", minimum=0.01)
 
@@ -72,7 +78,7 @@ class RangeSeen:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DriftState:
-    """Means (W, 8) and covariances (W, 8, 8) of the bank at a time, and log weights (W,)."""
+    """Means (W, 6) and covariances (W, 6, 6) of the bank at a time, and log weights (W,)."""
 
     time_s: float
     means: Array
@@ -80,7 +86,7 @@ class DriftState:
     log_weights: Array
 
     def blended(self) -> tuple[Array, Array]:
-        """Return mean (8,) and covariance (8, 8) of all filters together."""
+        """Return mean (6,) and covariance (6, 6) of all filters together."""
         weights = np.exp(self.log_weights - self.log_weights.max())
         weights /= weights.sum()
         mean = weights @ self.means
@@ -105,10 +111,10 @@ class DriftFilter:
         Walks are log-normal about the believed one, which is the root of their mean square.
         """
         s, size = self._settings, len(_WALKS)
-        sigmas = np.repeat([s.start_sigma_m, s.bias_sigma_mps, 1.0, 1.0], 2)
+        sigmas = np.repeat([s.start_sigma_m, s.bias_sigma_mps, 1.0], 2)
         state = DriftState(
             time_s=min(time_s, 0.0),
-            means=np.zeros((size, 8)),
+            means=np.zeros((size, 6)),
             covariances=np.tile(np.diag(sigmas**2), (size, 1, 1)),
             log_weights=self._log_prior,
         )
@@ -118,21 +124,19 @@ class DriftFilter:
         """Return the state after something seen, at its time."""
         state = self.predicted(state, max(one.time_s, state.time_s))
         seen = [
-            self._measured(mean, covariance, one)
+            self._innovation(mean, covariance, one)
             for mean, covariance in zip(state.means, state.covariances, strict=True)
         ]
-        innovation, design, noise = (np.stack(part) for part in zip(*seen, strict=True))
-        across = design @ state.covariances
-        spread = across @ design.mT + noise
-        gain = np.linalg.solve(spread, across).mT
-        keep = np.eye(8) - gain @ design
+        innovation, spread, shared = (np.stack(part) for part in zip(*seen, strict=True))
+        gain = np.linalg.solve(spread, shared.mT).mT
         missed = np.linalg.solve(spread, innovation[..., None])[..., 0]
         log_likely = -0.5 * (np.linalg.slogdet(spread)[1] + (innovation * missed).sum(axis=1))
         log_likely = np.maximum(log_likely, log_likely.max() - _MOST_TOLD)  # it may be a wrong one
+        covariances = state.covariances - gain @ shared.mT
         return DriftState(
             time_s=state.time_s,
             means=state.means + (gain @ innovation[..., None])[..., 0],
-            covariances=keep @ state.covariances @ keep.mT + gain @ noise @ gain.mT,
+            covariances=(covariances + covariances.mT) / 2,
             log_weights=state.log_weights + log_likely,
         )
 
@@ -149,19 +153,20 @@ class DriftFilter:
             state.blended(),
             (state.means[_BELIEVED], state.covariances[_BELIEVED]),
         ):
-            innovation, design, noise = self._measured(mean, covariance, one)
-            spread = design @ covariance @ design.T + noise
+            innovation, spread, _ = self._innovation(mean, covariance, one)
+            if isinstance(one, AnswerSeen):  # a leader may change its mind: as if told anew
+                spread = covariance[:2, :2] + one.sigma_m**2 * np.eye(2)
             squares.append(float(innovation @ np.linalg.solve(spread, innovation)))
         return min(squares)
 
     def predicted(self, state: DriftState, time_s: float) -> DriftState:
         """Return the state at a later time."""
         s, interval_s = self._settings, time_s - state.time_s
-        alike, kept = np.exp(-interval_s / np.array([s.answers_alike_s, s.walk_memory_s]))
-        transition = np.diag([1.0, 1.0, 1.0, 1.0, alike, alike, alike, alike])
+        alike, kept = np.exp(-interval_s / np.array([s.leader_alike_s, s.walk_memory_s]))
+        transition = np.diag([1.0, 1.0, 1.0, 1.0, alike, alike])
         transition[:2, 2:4] = interval_s * np.eye(2)
-        fresh = np.diag([s.odometry_noise**2 * interval_s, 0.0, 1 - alike**2, 1 - alike**2])
-        wandered = np.zeros((4, 4))
+        fresh = np.diag([s.odometry_noise**2 * interval_s, 0.0, 1 - alike**2])
+        wandered = np.zeros((3, 3))
         wandered[:2, :2] = np.array([[interval_s**2 / 3, interval_s / 2], [interval_s / 2, 1.0]])
         wandered *= interval_s
         noise = fresh + self._walks[:, None, None] ** 2 * wandered
@@ -172,26 +177,29 @@ class DriftFilter:
             log_weights=self._log_prior + kept * (state.log_weights - self._log_prior),
         )
 
-    def _measured(
+    def _innovation(
         self, mean: Array, covariance: Array, one: AnswerSeen | RangeSeen
     ) -> tuple[Array, Array, Array]:
-        """Return innovation (M,), design (M, 8) and noise (M, M) of something seen."""
+        """Return what was not expected (M,), its covariance (M, M), and (6, M) with the state."""
         s, fresh = self._settings, self._settings.fresh_share
-        lasting = float(np.sqrt(1.0 - fresh**2))
+        known_m2 = covariance[:2, :2]
         if isinstance(one, AnswerSeen):
-            design = np.zeros((2, 8))
-            design[:, :2], design[:, 4:6] = np.eye(2), lasting * one.sigma_m * np.eye(2)
-            noise = (fresh * one.sigma_m) ** 2 * np.eye(2)
-            return one.ran_away_m - design @ mean, design, noise
-        leader_error_m = lasting * one.leader_sigma_m * mean[6:8]
+            news_m2, axes = np.linalg.eigh(known_m2 - one.sigma_m**2 * np.eye(2))
+            learned_m2 = (axes * np.maximum(news_m2, 0.0)) @ axes.T
+            spread_m2 = learned_m2 + (fresh * one.sigma_m) ** 2 * np.eye(2)
+            shared = covariance[:, :2] @ np.linalg.solve(known_m2, learned_m2)
+            return one.ran_away_m - mean[:2], spread_m2, shared
+        lasting = float(np.sqrt(1.0 - fresh**2))
+        leader_error_m = lasting * one.leader_sigma_m * mean[4:6]
         between_m = one.reckoned_m - mean[:2] - (one.leader_m - leader_error_m)
         predicted_m = max(float(np.hypot(*between_m)), 1.0)
         direction = between_m / predicted_m
-        design = np.zeros((1, 8))
-        design[0, :2], design[0, 6:8] = -direction, lasting * one.leader_sigma_m * direction
+        design = np.zeros((1, 6))
+        design[0, :2], design[0, 4:6] = -direction, lasting * one.leader_sigma_m * direction
         # beyond the first order: across the range, the position's uncertainty bends it
-        across_m2 = float(np.trace(covariance[:2, :2])) / predicted_m
+        across_m2 = float(np.trace(known_m2)) / predicted_m
         steepness = one.apart_m / predicted_m  # noise counts for more across than along a slant
         range_m2 = s.range_sigma_m**2 * (1.0 + steepness**2)
         variance_m2 = range_m2 + (fresh * one.leader_sigma_m) ** 2 + across_m2**2 / 4
-        return np.array([one.range_m - predicted_m]), design, np.array([[variance_m2]])
+        shared = covariance @ design.T
+        return np.array([one.range_m - predicted_m]), design @ shared + variance_m2, shared

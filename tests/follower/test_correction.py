@@ -165,6 +165,21 @@ def test_many_answers_with_one_lasting_error_do_not_average_it_away() -> None:
     assert 1.0 < np.sqrt(covariance_m2[0, 0]) < 3.0
 
 
+def test_what_a_leader_says_again_and_again_is_believed_once() -> None:
+    """A leader that was told one thing early carries it on: its answers grow, their news does not.
+
+    It knows the drift to 0.1 instead of 0.15 m/s, and learns no more.
+    """
+    correction, s = DriftCorrection(0.0, CorrectionSettings()), CorrectionSettings()
+    for time_s in np.arange(80.0, 400.0, 40.0):
+        said_m = np.array([0.15 * time_s, 0.0])
+        variance_m2 = (0.1 * time_s) ** 2 + s.odometry_noise**2 * time_s
+        correction.receive_answer(float(time_s), said_m, np.zeros(2), float(np.sqrt(variance_m2)))
+    position_m, covariance_m2 = correction.corrected(float(time_s), said_m)
+    assert position_m == pytest.approx([0.0, 0.0], abs=3.0)
+    assert variance_m2 < covariance_m2[0, 0] < 1.3 * variance_m2
+
+
 def test_ranges_to_the_leader_correct_along_their_direction() -> None:
     correction = DriftCorrection(0.0, CorrectionSettings())
     for time_s in np.arange(100.0, 200.0, 10.0):

@@ -5,7 +5,10 @@ that were taken but not acknowledged, the instant that was cut short. A repeat i
 first time, without the core.
 """
 
+import logging
 from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from firmware.inputs import (
@@ -23,9 +26,22 @@ from firmware.inputs import (
 )
 from firmware.journal import Journal
 from firmware.soundings import Odometry, Ping
+from firmware.store_file import StoreUnusableError
 
+LOG = logging.getLogger(__name__)
 _NEVER_S = -float("inf")
 _HEARD_AGAIN = 256  # frames that a modem may hand over a second time: its own cap of events
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CoreInputs:
+    """What every core is given and asked, past its journal."""
+
+    odometry: Callable[[Odometry], None]
+    ping: Callable[[Ping], None]
+    frame: Callable[[bytes, float | None, float], None]
+    tick: Callable[[float], None]
+    poll: Callable[[float], bytes | None]
 
 
 class Recorder:
@@ -131,38 +147,46 @@ class Recorder:
 
     # replay
 
-    def replayed_odometry(self, body: bytes) -> Odometry:
-        """Return navigation of the journal."""
-        odometry = to_odometry(body)
-        self.last_odometry_s = odometry.time_s
-        return odometry
+    def replay(self, core: CoreInputs, other: Callable[[int, bytes], None]) -> None:
+        """Give a core what the journal holds, and what only its sort is asked to the other.
 
-    def replayed_fan(self, body: bytes) -> None:
-        """Take the beams' angles of the pings that follow."""
-        self._fan = body
-
-    def replayed_ping(self, body: bytes) -> Ping:
-        """Return a ping of the journal."""
-        ping = to_ping(body, self._fan or b"")
-        self._last_ping_s = ping.time_s
-        return ping
-
-    def replayed_frame(self, body: bytes) -> Heard:
-        """Return a frame of the journal."""
-        heard = to_heard(body)
-        self._heard.append(heard)
-        return heard
-
-    def replayed_tick(self, body: bytes) -> float:
-        """Return an instant of the journal."""
-        self.last_tick_s = self._committed_s = to_instant(body)
-        return self.last_tick_s
-
-    def replayed_poll(self, now_s: float, frame: bytes | None) -> None:
-        """Keep what the core answers at an instant of the journal."""
-        self._polled = (now_s, frame)
-
-    def resume(self) -> None:
-        """Go on from the journal's end."""
+        Raises StoreUnusableError for a record that is none. Whatever else an input raises, it
+        raised when it came for the first time as well, and the mission went on.
+        """
+        for kind, body in self.journal.replay():
+            try:
+                self._replay(kind, body, core, other)
+            except StoreUnusableError:
+                raise
+            except Exception:
+                self.journal.counters["store_inputs_failed"] += 1
+                LOG.exception("an input failed again in the replay")
         self._resumed_s = self.last_tick_s
         self.journal.counters["store_resumed"] += 1
+
+    def _replay(
+        self, kind: int, body: bytes, core: CoreInputs, other: Callable[[int, bytes], None]
+    ) -> None:
+        match kind:
+            case Kind.ODOMETRY:
+                odometry = to_odometry(body)
+                self.last_odometry_s = odometry.time_s
+                core.odometry(odometry)
+            case Kind.PING:
+                ping = to_ping(body, self._fan or b"")
+                self._last_ping_s = ping.time_s
+                core.ping(ping)
+            case Kind.FAN:
+                self._fan = body
+            case Kind.FRAME:
+                heard = to_heard(body)
+                self._heard.append(heard)
+                core.frame(heard.frame, heard.toa_s, heard.now_s)
+            case Kind.TICK:
+                self.last_tick_s = self._committed_s = to_instant(body)
+                core.tick(self.last_tick_s)
+            case Kind.POLL:
+                now_s = to_instant(body)
+                self._polled = (now_s, core.poll(now_s))
+            case _:
+                other(kind, body)

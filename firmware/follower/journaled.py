@@ -1,19 +1,16 @@
 """A follower that survives a kill: its inputs go to a journal before anything leaves."""
 
-import logging
-
 from firmware.checkpoints import NotNowError, read, written
 from firmware.dead_reckoning import ReckonedState
 from firmware.follower.core import FollowerCore
 from firmware.follower.settings import FollowerSettings
-from firmware.inputs import Heard, Kind, from_state, to_instant, to_state
+from firmware.inputs import Heard, from_state, to_state
 from firmware.journal import Journal
-from firmware.recorder import Recorder
+from firmware.recorder import CoreInputs, Recorder
 from firmware.soundings import Odometry, Ping
 from firmware.store_file import StoreUnusableError
 from protocol.schedule import Slots
 
-LOG = logging.getLogger(__name__)
 _RECORDER = "recorder"
 
 
@@ -100,32 +97,16 @@ class JournaledFollower(FollowerCore):
             state, marks = read(body)
             self.__dict__.update(state)
             self.recorder.restore(marks)
-        for kind, record in self.recorder.journal.replay():
-            try:
-                self._replay(kind, record)
-            except StoreUnusableError:
-                raise
-            except Exception:  # as the loop did when it came for the first time
-                self.recorder.journal.counters["store_inputs_failed"] += 1
-                LOG.exception("an input failed again in the replay")
-        self.recorder.resume()
+        plain = CoreInputs(
+            odometry=super().receive_odometry,
+            ping=super().receive_ping,
+            frame=super().receive_frame,
+            tick=super().tick,
+            poll=super().poll,
+        )
+        self.recorder.replay(plain, _refuse)
 
-    def _replay(self, kind: int, body: bytes) -> None:
-        recorder = self.recorder
-        match kind:
-            case Kind.ODOMETRY:
-                super().receive_odometry(recorder.replayed_odometry(body))
-            case Kind.PING:
-                super().receive_ping(recorder.replayed_ping(body))
-            case Kind.FAN:
-                recorder.replayed_fan(body)
-            case Kind.FRAME:
-                heard = recorder.replayed_frame(body)
-                super().receive_frame(heard.frame, heard.toa_s, heard.now_s)
-            case Kind.TICK:
-                super().tick(recorder.replayed_tick(body))
-            case Kind.POLL:
-                now_s = to_instant(body)
-                recorder.replayed_poll(now_s, super().poll(now_s))
-            case _:
-                raise StoreUnusableError(f"a follower has no input of kind {kind}")
+
+def _refuse(kind: int, body: bytes) -> None:
+    del body
+    raise StoreUnusableError(f"a follower has no input of kind {kind}")

@@ -8,7 +8,6 @@ replayed; ISAM2, which is not written, has just been built from the ledger, and 
 import contextlib
 import dataclasses
 import json
-import logging
 import struct
 from collections.abc import Iterator
 from typing import Any
@@ -18,18 +17,17 @@ import numpy as np
 from firmware.belief import Belief
 from firmware.checkpoints import NotNowError, read, written
 from firmware.dead_reckoning import ReckonedState
-from firmware.inputs import Heard, Kind, from_state, to_instant, to_state
+from firmware.inputs import Heard, Kind, from_state, to_state
 from firmware.journal import Journal
 from firmware.leader.core import LeaderCore
 from firmware.leader.match_jobs import Findings, SheetJobs
 from firmware.leader.matches import Hint, Match, MatchOutcome, NoMatch
 from firmware.leader.settings import LeaderSettings
-from firmware.recorder import Recorder
+from firmware.recorder import CoreInputs, Recorder
 from firmware.soundings import Odometry, Ping
 from firmware.store_file import StoreUnusableError
 from protocol.schedule import Slots
 
-LOG = logging.getLogger(__name__)
 _RECORDER = "recorder"
 _NOW = struct.Struct("<d")
 
@@ -149,34 +147,18 @@ class JournaledLeader(LeaderCore):
             self.__dict__.update(state)
             self.atlas.shelf = self.recorder.journal
             self.recorder.restore(marks)
-        for kind, body in self.recorder.journal.replay():
-            try:
-                with self._within():
-                    self._replay(kind, body)
-            except StoreUnusableError:
-                raise
-            except Exception:  # as the loop did when it came for the first time
-                self.recorder.journal.counters["store_inputs_failed"] += 1
-                LOG.exception("an input failed again in the replay")
-        self.recorder.resume()
+        plain = CoreInputs(
+            odometry=super().receive_odometry,
+            ping=super().receive_ping,
+            frame=super().receive_frame,
+            tick=super().tick,
+            poll=super().poll,
+        )
+        with self._within():
+            self.recorder.replay(plain, self._replay)
 
     def _replay(self, kind: int, body: bytes) -> None:
-        recorder = self.recorder
         match kind:
-            case Kind.ODOMETRY:
-                super().receive_odometry(recorder.replayed_odometry(body))
-            case Kind.PING:
-                super().receive_ping(recorder.replayed_ping(body))
-            case Kind.FAN:
-                recorder.replayed_fan(body)
-            case Kind.FRAME:
-                heard = recorder.replayed_frame(body)
-                super().receive_frame(heard.frame, heard.toa_s, heard.now_s)
-            case Kind.TICK:
-                super().tick(recorder.replayed_tick(body))
-            case Kind.POLL:
-                now_s = to_instant(body)
-                recorder.replayed_poll(now_s, super().poll(now_s))
             case Kind.BELIEF:
                 super().belief()
             case Kind.JOBS:

@@ -1,7 +1,9 @@
 """Sub-maps rebuilt on a grid from the pseudo points that arrived.
 
 Source: paper, section 4.2: Gaussian process regression (Eq. 5, 6) inside the outer edges of the
-points' Delaunay triangulation; depths with a variance above 0.1 are dropped.
+points' Delaunay triangulation; depths with a variance above 0.1 are dropped. That is the map's own
+variance, without sigma^2 of the soundings: else nothing were left of a survey from 100 m above the
+seabed. A lattice tells one variance, that of soundings about it all, and nothing of it is dropped.
 """
 
 from collections.abc import Mapping
@@ -39,7 +41,9 @@ class ReconstructionSettings(Settings):
     cell_m: float = setting(
         2.0, "m", "the grid of the matching, own sub-maps too (paper, 6.1)", minimum=0.05
     )
-    max_variance_m2: float = setting(0.1, "m2", "paper, 4.2: above it depths are dropped")
+    max_variance_m2: float = setting(
+        0.1, "m2", "paper, 4.2: above it depths are dropped", minimum=0.0
+    )
     max_cells: int = setting(
         1_000_000, "cells", "25 MB; a swath at 1 m has 22,500", minimum=100, maximum=10_000_000
     )
@@ -130,7 +134,6 @@ def lattice_grid(
     row, column = np.nonzero(np.ones((north_m.size, east_m.size), dtype=bool))
     position_m = np.column_stack([north_m[row], east_m[column]])
     wanted = inside_footprint(found.mask, found.frame, position_m)
-    wanted &= found.variance_m2 <= settings.max_variance_m2
     depth_m = np.full((north_m.size, east_m.size), np.nan)
     depth_m[row[wanted], column[wanted]] = found.depth_m(position_m[wanted])
     good = np.isfinite(depth_m)
@@ -185,7 +188,7 @@ def reconstruct_points(
     north_m, east_m = _axes(points[:, :2], settings)
     inside = _inside(points[:, :2], north_m, east_m)
     depth_m, variance_m2 = gridded(decoder, north_m, east_m, inside)
-    depth_m[variance_m2 > settings.max_variance_m2] = np.nan
+    depth_m[variance_m2 - hyper.sigma2_m2 > settings.max_variance_m2] = np.nan
     variance_m2[np.isnan(depth_m)] = np.nan
     return GriddedSubmap(
         north0_m=float(north_m[0]),

@@ -24,7 +24,7 @@ from firmware.submaps import Track
 from protocol.arithmetic import Decoder, Encoder
 from protocol.errors import EstimationError
 from protocol.packets import Header, Profile, SubmapFragment
-from tests.compression.conftest import Survey, relief_m
+from tests.compression.conftest import Survey, made_survey, relief_m
 
 RNG = np.random.default_rng(3)
 PLACES_M = RNG.uniform([-40.0, -70.0], [40.0, 70.0], (150, 2))
@@ -116,6 +116,18 @@ def fragments(survey: Survey) -> list[SubmapFragment]:
     compressed = compress(survey.bins, CompressionSettings(), "lattice")
     packets = packets_from(compressed, survey.track, submap_header())
     return [packet for packet in packets if isinstance(packet, SubmapFragment)]
+
+
+@pytest.mark.parametrize("profile", ["paper", "dense", "lattice"])
+def test_a_map_of_noisy_soundings_is_kept_as_one_of_good_ones_is(profile: str) -> None:
+    """From 100 m above the seabed a beam's noise alone has a variance above 0.1."""
+    areas_m2 = []
+    for noise_m in (0.15, 0.5):
+        survey = made_survey(noise_m=noise_m)
+        packets = packets_from(compress(survey.bins, None, profile), survey.track, submap_header())
+        found = reconstruct_packets(dict(enumerate(packets)), ReconstructionSettings(), 0.0).grid
+        areas_m2.append(np.count_nonzero(np.isfinite(found.depth_m)) * found.cell_m**2)
+    assert areas_m2[1] > 0.8 * areas_m2[0] > 0.0
 
 
 def error_m(fragments: list[SubmapFragment], kept: list[int]) -> float:

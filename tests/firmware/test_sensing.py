@@ -104,3 +104,19 @@ def test_builder_closes_a_submap_at_the_end_of_its_window_and_numbers_wrap() -> 
     assert submaps[1].track.time_s.tolist() == list(np.arange(8.0, 16.0))
     assert (submaps[1].bins.time_s >= 8.0).all()
     assert (submaps[1].bins.time_s < 16.0).all()
+
+
+@pytest.mark.parametrize("time_s", [4.25, 1.7e9, -1e7, np.nan])
+def test_a_ping_of_another_time_than_navigation_has_no_place(time_s: float) -> None:
+    builder = SubmapBuilder(
+        1, 0, settings=SubmapSettings(), sonar=SonarSettings(), binning=BinningSettings()
+    )
+    state = DeadReckoning(START).receive_odometry(odometry(1.0))
+    for at_s in (1.0, time_s):
+        builder.receive_state(state)
+        builder.receive_ping(ping(time_s=at_s), state)
+    builder.receive_state(dataclasses.replace(state, time_s=41.0))
+    submap = builder.take()
+    assert submap is not None
+    assert (submap.bins.time_s == 1.0).all()
+    assert builder.bad_pings == 1

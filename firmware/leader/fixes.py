@@ -26,6 +26,9 @@ class FixSettings(Settings):
     sigma_floor_m: float = setting(
         1.0, "m", "way between the antenna, the instant and the key frame", minimum=0.0
     )
+    sigma_limit_m: float = setting(
+        1e4, "m", "a fix that is worse says nothing of a survey", minimum=1.0
+    )
     held: int = setting(64, "fixes", "of vehicles whose track is late; the oldest go", minimum=1)
     longest_wait_s: float = setting(900.0, "s", "as long as a follower keeps a frame", minimum=10.0)
 
@@ -40,7 +43,8 @@ class Fixes:
 
     def hold(self, time_s: float, fix: Fix) -> None:
         """Keep a fix until it can be used."""
-        if not np.isfinite([fix.north_m, fix.east_m]).all() or not fix.sigma_m > 0.0:
+        sane = np.isfinite([fix.north_m, fix.east_m]).all()
+        if not sane or not 0.0 < fix.sigma_m <= self._settings.sigma_limit_m:
             self.counters["fixes_bad"] += 1
             return
         if len(self._held) == self._held.maxlen:
@@ -49,11 +53,11 @@ class Fixes:
 
     def use(self, fleet: Fleet, graph: PoseGraph, now_s: float) -> None:
         """Judge and enter the fixes whose vehicles are known at their times."""
-        waiting = []
-        for time_s, fix in self._held:
+        for _ in range(len(self._held)):
+            time_s, fix = self._held.popleft()
             if not fleet.reaches(fix.vehicle, time_s):
                 if now_s - time_s <= self._settings.longest_wait_s:
-                    waiting.append((time_s, fix))
+                    self._held.append((time_s, fix))
                 else:
                     self.counters["fixes_too_late"] += 1
                 continue
@@ -61,7 +65,6 @@ class Fixes:
                 self.counters[self._entered(time_s, fix, fleet, graph)] += 1
             except EstimationError:
                 self.counters["fixes_unplaceable"] += 1
-        self._held = deque(waiting, self._settings.held)
 
     def _entered(self, time_s: float, fix: Fix, fleet: Fleet, graph: PoseGraph) -> str:
         chain = fleet.chain_at(fix.vehicle, time_s)

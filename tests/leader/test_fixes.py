@@ -54,7 +54,10 @@ def test_fix_that_the_estimate_finds_impossible_is_counted_and_dropped() -> None
     assert leader.belief().position_m[0] == pytest.approx(123.5, abs=3.0)
 
 
-@pytest.mark.parametrize(("north_m", "sigma_m"), [(np.nan, 2.0), (120.0, 0.0), (120.0, np.nan)])
+@pytest.mark.parametrize(
+    ("north_m", "sigma_m"),
+    [(np.nan, 2.0), (120.0, 0.0), (120.0, np.nan), (120.0, np.inf), (120.0, 1e200)],
+)
 def test_fix_without_numbers_is_counted(north_m: float, sigma_m: float) -> None:
     fix = Fix(north_m=north_m, east_m=0.0, sigma_m=sigma_m)
     assert sailed(60, fix).status()["fixes_bad"] == 1

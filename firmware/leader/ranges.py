@@ -146,6 +146,9 @@ class RangeJudge:
         reads_true = (1.0 - share) * as_true[:, i, j]
         reads_stretched = share * as_stretched[:, i, j]
         total = reads_true + reads_stretched + _WILD_DENSITY
+        alike = (s.outlier_factor - 1.0) * predicted_m < sigma_m  # stretched or not is all one
+        reads_true = np.where(alike, reads_true + reads_stretched, reads_true)
+        reads_stretched = np.where(alike, 0.0, reads_stretched)
         true = sane & (reads_true > 0.9 * total)
         stretched = sane & (reads_stretched > 0.9 * total)
         return RangeVerdict(true=true, stretched=stretched, certain=certain)

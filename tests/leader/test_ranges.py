@@ -45,6 +45,15 @@ def test_drift_within_the_window_does_not_hide_what_is_stretched() -> None:
     assert verdict.stretched.tolist() == stretched.tolist()
 
 
+@pytest.mark.parametrize("factor", [1.0, 1.001])
+def test_a_stretch_too_small_to_be_told_is_none(factor: float) -> None:
+    judge = RangeJudge(RangeSettings(outlier_factor=factor))
+    true_m = 300.0 + np.arange(10.0)
+    verdict = judge.judge(true_m, true_m, TIMES_S, 3.0)
+    assert verdict.true.all()
+    assert not verdict.stretched.any()
+
+
 def test_window_with_two_equal_explanations_is_left_undecided() -> None:
     judge = RangeJudge(RangeSettings())
     true_m = np.full(6, 300.0)

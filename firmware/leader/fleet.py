@@ -135,7 +135,7 @@ class Fleet:
 
     def use_ranges(self, chain: int) -> None:
         """Use the held ranges whose senders' states are known by now."""
-        if chain in self._graph.vehicles():
+        if chain in self._graph.vehicles() and len(self.own):
             self._ranging.use(chain, self.track(chain), LEADER, self.own.track(), self._graph)
 
     def settle(self, before_s: float) -> None:

@@ -92,6 +92,8 @@ class PoseGraph(Estimate):
         Epochs in a gap of the track are passed over: positions are composed, so the next node
         ties to the last across the gap.
         """
+        if not track.time_s.size:
+            return 0
         chain, s = self._chains[vehicle], self._settings
         interval_s = s.node_interval_s
         begin = int(np.floor(chain.times_s[-1] / interval_s + 1e-9)) + 1

@@ -245,3 +245,14 @@ def test_lost_fragments_are_asked_for_and_repeated_where_the_air_has_room() -> N
     )
     sent = [packet for packet, _ in repeated.up]
     assert len(sent) <= len(plain.up) * 5 / 3  # the two that were lost of each sub-map
+
+
+def test_a_follower_is_heard_before_the_leader_has_navigation() -> None:
+    """A leader whose navigation starts late, or never, loses none of its sub-maps."""
+    leader = leader_of(line(0.0, 0.0))
+    for frame, sent_s in FRAMES:
+        leader.receive_frame(frame, sent_s + 0.04, sent_s + 1.0)
+        leader.tick(sent_s + 1.0)
+        leader.poll(sent_s + 1.0)
+    leader.tick(400.0)
+    assert len(sheets_of(leader)) == len({decode(frame).header.submap for frame, _ in FRAMES})

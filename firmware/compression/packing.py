@@ -16,6 +16,7 @@ from firmware.compression.results import (
 from firmware.compression.settings import CompressionSettings
 from firmware.compression.steps import run
 from firmware.compression.track_code import encode_track
+from firmware.geometry import wrap_angle
 from firmware.submaps import Track
 from protocol.errors import EstimationError, LocalProtocolError
 from protocol.packets import (
@@ -27,6 +28,8 @@ from protocol.packets import (
     SubmapPacket,
 )
 from protocol.timestamps import QUARTERS_MODULO
+
+_ON_TIME_S = 1e-6
 
 
 def submap_header(
@@ -57,7 +60,7 @@ def packets_from(
     if isinstance(compressed, CompressedCode):
         return _fragments(compressed, _bodies(compressed, encode_track(track)), header)
     points = fragment_points(compressed)
-    states = _by_second(track, STATES_PER_FRAGMENT * len(points))
+    states = states_by_second(track, STATES_PER_FRAGMENT * len(points))
     packets = []
     for index, fragment in enumerate(points):
         first_s = index * STATES_PER_FRAGMENT
@@ -119,12 +122,17 @@ def _fragments(
     ]
 
 
-def _by_second(track: Track, seconds: int) -> NDArray[np.float32]:
-    """Return north, east, yaw (seconds, 3) at each whole second after the first state, or NaN."""
+def states_by_second(track: Track, seconds: int) -> NDArray[np.float32]:
+    """Return north, east, yaw (seconds, 3) at each whole second after the first state.
+
+    It is NaN beyond the last state, and where none is within a second.
+    """
     states = np.full((seconds, 3), np.nan, dtype=np.float32)
     if track.time_s.size:
-        second = np.round(track.time_s - track.time_s[0]).astype(int)
-        kept = (second >= 0) & (second < seconds)
-        rows = np.column_stack([track.north_m, track.east_m, track.yaw_rad])
-        states[second[kept]] = rows[kept]
+        times_s = track.time_s[0] + np.arange(seconds)
+        times_s = times_s[times_s <= track.time_s[-1] + _ON_TIME_S]
+        known = np.array([track.gap_s(time_s) < 1.0 for time_s in times_s])
+        yaw_rad = wrap_angle(np.interp(times_s, track.time_s, np.unwrap(track.yaw_rad)))
+        rows = np.column_stack([track.position_at(times_s), yaw_rad])
+        states[: len(times_s)][known] = rows[known]
     return states

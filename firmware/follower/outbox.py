@@ -3,8 +3,7 @@
 from collections import Counter
 from collections.abc import Sequence
 
-import numpy as np
-
+from firmware.compression.packing import states_by_second
 from firmware.dead_reckoning import ReckonedState
 from firmware.submap_builder import track_of
 from protocol.packets import Header, Packet, Profile, SubmapFragment, SubmapPacket, TrajectoryPacket
@@ -65,9 +64,6 @@ class Outbox:
         count = _STATES[self._profile]
         newest_s = states[-1].time_s
         track = track_of([state for state in states if state.time_s > newest_s - count + 0.5])
-        offsets = np.round(track.time_s - track.time_s[0]).astype(int)
-        rows = np.full((count, 3), np.nan, dtype=np.float32)
-        rows[offsets] = np.column_stack([track.north_m, track.east_m, track.yaw_rad])
         self._trajectory_packets = (self._trajectory_packets + 1) % (1 << 16)
         header = Header(
             profile=self._profile,
@@ -79,4 +75,4 @@ class Outbox:
             tx_second=to_tx_second(slot_s),
             time_quarters=to_quarters(float(track.time_s[0])),
         )
-        return TrajectoryPacket(header=header, states=rows)
+        return TrajectoryPacket(header=header, states=states_by_second(track, count))

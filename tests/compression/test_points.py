@@ -12,9 +12,10 @@ from firmware.compression import (
     fragment_points,
     packets_from,
 )
-from firmware.compression.packing import submap_header
+from firmware.compression.packing import states_by_second, submap_header
 from firmware.compression.settings import CompressionSettings
 from firmware.leader.reconstruction import ReconstructionSettings, reconstruct_packets
+from firmware.submaps import Track
 from protocol.codec import decode, encode
 from protocol.packets import SubmapPacket
 from tests.compression.conftest import Survey, relief_m
@@ -73,3 +74,26 @@ def test_points_of_one_fragment_are_spread_over_the_whole_map(survey: Survey) ->
     for points in fragment_points(compressed):
         assert np.ptp(points[:, 0]) > 50.0
         assert np.ptp(points[:, 1]) > 80.0
+
+
+@pytest.mark.parametrize("period_s", [0.25, 0.7, 0.9])
+def test_a_slice_holds_where_the_vehicle_was_at_its_whole_seconds(period_s: float) -> None:
+    time_s = np.arange(0.0, 40.0, period_s)
+    track = Track(
+        time_s=time_s,
+        north_m=2.0 * time_s,
+        east_m=np.zeros(time_s.size),
+        yaw_rad=np.full(time_s.size, np.pi - 1e-3) * (-1.0) ** np.arange(time_s.size),
+    )
+    states = states_by_second(track, 45)
+    known = int(time_s[-1]) + 1
+    assert states[:known, 0] == pytest.approx(2.0 * np.arange(known), abs=1e-4)
+    assert np.abs(states[:known, 2]) == pytest.approx(np.full(known, np.pi), abs=2e-3)
+    assert np.isnan(states[known:]).all()
+
+
+def test_a_slice_is_empty_where_navigation_was_away() -> None:
+    time_s = np.array([0.0, 1.0, 2.0, 8.0, 9.0])
+    track = Track(time_s=time_s, north_m=time_s, east_m=time_s, yaw_rad=np.zeros(time_s.size))
+    found = np.isfinite(states_by_second(track, 12)).all(axis=1)
+    assert found.tolist() == [True] * 3 + [False] * 5 + [True] * 2 + [False] * 2

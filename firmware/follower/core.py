@@ -120,7 +120,10 @@ class FollowerCore:
         if self._fit is None:
             return
         for _ in range(self._settings.steps_per_tick):
-            step = next(self._fit.steps, None)
+            try:
+                step = next(self._fit.steps, None)
+            except EstimationError:
+                step = None
             if step is None:
                 self._end_fit()
                 return
@@ -176,11 +179,7 @@ class FollowerCore:
             self.counters["submaps_too_thin"] += 1
             return
         self._last_submap_s = float(submap.track.time_s[-1])
-        try:
-            steps = compress_steps(submap.bins, self._compression, self._settings.profile)
-        except EstimationError:
-            self.counters["submaps_unfit"] += 1
-            return
+        steps = compress_steps(submap.bins, self._compression, self._settings.profile)
         self._fit = _Fit(submap=submap, steps=steps)
 
     def _end_fit(self) -> None:
@@ -229,13 +228,13 @@ class FollowerCore:
 
     def _receive_range(self, answer: ExtendedAnswer, toa_s: float, now_s: float) -> None:
         """Range-aid: the answer says where the leader was, its way how far that is from here."""
+        if not abs(now_s - toa_s) <= _LONGEST_AIRTIME_S:
+            self.counters["ranges_unplaceable"] += 1
+            return
         sent_s = transmission_s(answer.header.tx_second, toa_s)
         s, depth_m = self._settings.correction, self._reckoning.state.depth_m
         leader_m = depth_m if s.leader_depth_m is None else s.leader_depth_m
         speed_mps = s.sound_profile.speed_mps(leader_m, depth_m, s.sound_speed_mps)
-        if not abs(now_s - toa_s) <= _LONGEST_AIRTIME_S:
-            self.counters["ranges_unplaceable"] += 1
-            return
         self._correction.receive_range(
             toa_s,
             self._known_track().position_at(toa_s),

@@ -112,6 +112,16 @@ def test_a_fit_that_cannot_go_on_is_counted(monkeypatch: pytest.MonkeyPatch) -> 
     assert core.status()["fits_stopped_early"] >= 1
 
 
+def test_a_survey_beyond_what_frames_can_tell_is_counted_and_goes_on() -> None:
+    """Northings of a projection instead of metres from the datum: no cell is usable."""
+    far = line(4.6e6, 0.0)
+    core = follower_of(far)
+    for quarter in range(1, 240):
+        sail(core, far, quarter / 4.0)
+        core.tick(quarter / 4.0)
+    assert core.status()["submaps_unfit"] >= 1
+
+
 def test_paper_profile_in_shared_air_leaves_whole_submaps_out() -> None:
     core = follower_of(PATH, slots=slots_of(2), profile="paper")
     packets = [p for p in sent(core, 200.0) if isinstance(p, SubmapPacket)]
@@ -240,7 +250,7 @@ def test_range_to_a_leader_far_below_teaches_what_a_level_one_does() -> None:
     assert np.hypot(*(believed_m[2] - believed_m[0])) > 5.0
 
 
-@pytest.mark.parametrize("toa_s", [99.0, 99.0 + 100_000.0 / 1500.0, -50.0, 1e9])
+@pytest.mark.parametrize("toa_s", [99.0, 99.0 + 100_000.0 / 1500.0, -50.0, 1e9, np.nan, np.inf])
 def test_absurd_range_is_a_counted_drop(toa_s: float) -> None:
     core = surveyed()
     before_m = core.belief().position_m

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from firmware.soundings import Odometry
 
 _LONGEST_STEP_S = 5.0  # a longer gap is not bridged with one velocity: the position is held
+FASTEST_LOST_MPS = 3.0
+"""Sigma, each axis, of how far a survey vehicle goes while nobody measures it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -20,12 +22,18 @@ class ReckonedState:
 
 
 class DeadReckoning:
-    """Integrates odometry from a start; bad samples are counted and the last velocity is kept."""
+    """Integrates odometry from a start; bad samples are counted.
+
+    The last velocity is kept for five seconds. After that the position is held, and `lost_s` tells
+    of each step for how much of it nobody knows how far the vehicle went.
+    """
 
     def __init__(self, start: ReckonedState) -> None:
         self.state = start
         self.bad_samples = 0
+        self.lost_s = 0.0
         self._velocity_mps = (0.0, 0.0)
+        self._measured_s = start.time_s
 
     def receive_odometry(self, odometry: Odometry) -> ReckonedState:
         """Advance to the sample's time with its mean velocity since the last one; return the state.
@@ -33,18 +41,21 @@ class DeadReckoning:
         Non-finite velocities are replaced by the last good ones; samples that go back in time,
         or carry no finite time, are dropped.
         """
+        self.lost_s = 0.0
         interval_s = odometry.time_s - self.state.time_s
         if not math.isfinite(interval_s) or interval_s < 0.0:
             self.bad_samples += 1
             return self.state
         velocity_mps = (odometry.velocity_north_mps, odometry.velocity_east_mps)
         if all(map(math.isfinite, velocity_mps)):
-            self._velocity_mps = velocity_mps
+            self._velocity_mps, unmeasured_s = velocity_mps, interval_s
+            self._measured_s = odometry.time_s
         else:
             self.bad_samples += 1
-        if interval_s > _LONGEST_STEP_S:
-            self.bad_samples += 1
-            interval_s = 0.0
+            unmeasured_s = odometry.time_s - self._measured_s
+        if unmeasured_s > _LONGEST_STEP_S:
+            self.bad_samples += interval_s > _LONGEST_STEP_S
+            self.lost_s, interval_s = interval_s, 0.0
         self.state = ReckonedState(
             time_s=odometry.time_s,
             north_m=self.state.north_m + self._velocity_mps[0] * interval_s,

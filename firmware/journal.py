@@ -241,6 +241,13 @@ class Journal:
             }
         )
 
+    def count_epoch(self, epoch: int) -> None:
+        """Count an epoch that a core has begun by itself: its next life takes another."""
+        try:
+            self._epochs.write(epoch)
+        except OSError:
+            self.counters["store_epochs_uncounted"] += 1
+
     def _next_epoch(self) -> int:
         try:
             return self._epochs.following()

@@ -42,7 +42,7 @@ class SubmapBuilder:
         binning: BinningSettings,
         first_index: int = 0,
     ) -> None:
-        self._vehicle, self._boot_epoch = vehicle, boot_epoch
+        self._vehicle, self.boot_epoch = vehicle, boot_epoch
         self._settings, self._sonar, self._binning = settings, sonar, binning
         self._index = first_index
         self._bins = SoundingBins(binning)
@@ -55,7 +55,7 @@ class SubmapBuilder:
 
     def receive_state(self, state: ReckonedState) -> None:
         """Keep the state if its second is new; close the sub-map when its window is over."""
-        window = int(np.floor(state.time_s / self._settings.duration_s + 1e-9))
+        window = self._window_of(state)
         if self._window is not None and window != self._window:
             self._close(state)
         self._window = window
@@ -78,6 +78,11 @@ class SubmapBuilder:
             return
         self._bins.add(soundings_ned_m, ping.time_s)
 
+    def tear(self, state: ReckonedState) -> None:
+        """Forget what was measured of this sub-map: nobody knows how it lies to what follows."""
+        self._begin()
+        self._window = self._window_of(state)
+
     def take(self) -> Submap | None:
         """Return the sub-map that has been finished since the last call, or None."""
         finished, self._finished = self._finished, None
@@ -89,14 +94,20 @@ class SubmapBuilder:
         states = [*self._states, next_state] if self._states else [next_state]
         self._finished = Submap(
             vehicle=self._vehicle,
-            boot_epoch=self._boot_epoch,
+            boot_epoch=self.boot_epoch,
             index=self._index,
             track=track_of(self._states or states),
             bins=self._bins.result(),
         )
         self._index = (self._index + 1) % _SUBMAP_NUMBERS
+        self._begin()
+
+    def _begin(self) -> None:
         self._bins = SoundingBins(self._binning)
         self._states = []
+
+    def _window_of(self, state: ReckonedState) -> int:
+        return int(np.floor(state.time_s / self._settings.duration_s + 1e-9))
 
 
 def track_of(states: list[ReckonedState]) -> Track:

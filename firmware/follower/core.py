@@ -30,7 +30,7 @@ from protocol.errors import (
 from protocol.packets import Answer, ExtendedAnswer, SealedFrame
 from protocol.schedule import Slots, Turns
 from protocol.timestamps import from_quarters, to_quarters, transmission_s
-from protocol.vehicles import LEADER
+from protocol.vehicles import BOOT_EPOCHS, LEADER
 
 _IDLE_STATES = 20  # as many as a trajectory packet holds
 _LONGEST_AIRTIME_S = 5.0
@@ -72,6 +72,7 @@ class FollowerCore:
             binning=settings.binning,
         )
         self._track: deque[ReckonedState] = deque(maxlen=int(settings.track_s))
+        self._is_lost = False
         self._fit: _Fit | None = None
         self._compression = _fitting(settings, slots)
         self._outbox = Outbox(
@@ -83,6 +84,11 @@ class FollowerCore:
     def receive_odometry(self, odometry: Odometry) -> None:
         """Advance dead reckoning; a finished sub-map goes to the fit."""
         state = self._reckoning.receive_odometry(odometry)
+        if self._reckoning.lost_s > 0.0:
+            self._lose(state)
+            return
+        if self._is_lost:
+            self._begin_boot()
         if not self._track or state.time_s - self._track[-1].time_s >= 1.0 - 1e-6:
             self._track.append(state)
         self._builder.receive_state(state)
@@ -171,6 +177,20 @@ class FollowerCore:
             "ranges_gated": self._correction.ranges_gated,
         }
 
+    def _lose(self, state: ReckonedState) -> None:
+        """Doubt the way since the last state, and forget the sub-map that it tears."""
+        self._is_lost = True
+        self._builder.tear(state)
+        self._correction.lose(state.time_s - self._reckoning.lost_s, state.time_s)
+
+    def _begin_boot(self) -> None:
+        """Tell the leader that dead reckoning begins anew, as after a restart."""
+        self._is_lost = False
+        self.counters["navigation_lost"] += 1
+        self.boot_epoch = (self.boot_epoch + 1) % BOOT_EPOCHS
+        self._builder.boot_epoch = self._outbox.boot_epoch = self.boot_epoch
+        self._track.clear()
+
     def _begin_fit(self, submap: Submap) -> None:
         if self._fit is not None:
             self.counters["fits_cut_short"] += 1
@@ -193,7 +213,7 @@ class FollowerCore:
         self.counters["fits_stopped_early"] += not fit.best.report.settled
         header = submap_header(
             vehicle=self.vehicle,
-            boot_epoch=self.boot_epoch,
+            boot_epoch=fit.submap.boot_epoch,
             submap=fit.submap.index,
             time_quarters=to_quarters(float(fit.submap.track.time_s[0])),
         )

@@ -6,6 +6,7 @@ order of its times and filtered again whenever something older arrives. Nothing 
 reckoning itself.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +17,9 @@ from firmware.follower.drift_filter import (
     DriftFilter,
     DriftSettings,
     DriftState,
+    LostSpan,
     RangeSeen,
+    Seen,
 )
 from firmware.geometry import Array
 from firmware.sound_speed import SoundProfile, horizontal_m
@@ -55,7 +58,7 @@ class CorrectionSettings(DriftSettings):
 class _Filtered:
     """Something seen, and the state after it."""
 
-    one: AnswerSeen | RangeSeen
+    one: Seen
     state: DriftState
 
 
@@ -71,6 +74,7 @@ class DriftCorrection:
         self._filter = DriftFilter(settings)
         self._deployment = self._base = self._filter.deployed(start_time_s)
         self._seen: list[_Filtered] = []
+        self._lost: list[LostSpan] = []
         self._aside: AnswerSeen | None = None
         self._echo = False  # the newest answer may be dead reckoning again
         self.empty = 0
@@ -150,6 +154,19 @@ class DriftCorrection:
         self._take(seen)
         return True
 
+    def lose(self, begin_s: float, end_s: float) -> None:
+        """Doubt a span of which nobody knows how far the vehicle went."""
+        if self._lost and begin_s <= self._lost[-1].time_s:
+            begun = self._lost.pop()
+            begin_s = begun.time_s - begun.span_s
+            self._forget(begun)
+        self._lost.append(LostSpan(time_s=end_s, span_s=end_s - begin_s))
+        self._take(self._lost[-1])
+        if len(self._lost) > _KEPT:
+            first, second = self._lost[:2]
+            both_s = second.time_s - first.time_s + first.span_s
+            self._lost[:2] = [LostSpan(time_s=second.time_s, span_s=both_s)]
+
     def corrected(self, time_s: float, reckoned_m: Array) -> tuple[Array, Array]:
         """Return the believed position (2,) at the time, and its covariance (2, 2)."""
         newest = self._seen[-1].state if self._seen else self._base
@@ -165,7 +182,7 @@ class DriftCorrection:
         before = [s.state for s in self._seen if s.one.time_s <= time_s]
         return before[-1] if before else self._base
 
-    def _take(self, one: AnswerSeen | RangeSeen) -> None:
+    def _take(self, one: Seen) -> None:
         """Put something in its place, and filter again what is later."""
         later = [s.one for s in self._seen if s.one.time_s > one.time_s]
         self._seen = self._seen[: len(self._seen) - len(later)]
@@ -175,14 +192,19 @@ class DriftCorrection:
 
     def _forget_answer(self, time_s: float) -> None:
         """Take out the earlier answer for the same state."""
-        for k, s in enumerate(self._seen):
+        for s in self._seen:
             if isinstance(s.one, AnswerSeen) and abs(s.one.time_s - time_s) < 1e-6:
-                later = [s.one for s in self._seen[k + 1 :]]
-                self._seen = self._seen[:k]
-                self._filter_on(later)
+                self._forget(s.one)
                 return
 
-    def _filter_on(self, seen: list[AnswerSeen | RangeSeen]) -> None:
+    def _forget(self, one: Seen) -> None:
+        """Take something out, and filter again what is later; what the beginning holds stays."""
+        k = next((k for k, s in enumerate(self._seen) if s.one is one), len(self._seen))
+        later = [s.one for s in self._seen[k + 1 :]]
+        self._seen = self._seen[:k]
+        self._filter_on(later)
+
+    def _filter_on(self, seen: Sequence[Seen]) -> None:
         state = self._seen[-1].state if self._seen else self._base
         for one in seen:
             state = self._filter.updated(state, one)
@@ -205,7 +227,8 @@ class DriftCorrection:
     def _alone_m2(self, time_s: float) -> float:
         """Return the variance of dead reckoning that nobody corrects, along one axis."""
         at_s = max(time_s, self._deployment.time_s)
-        return float(self._filter.predicted(self._deployment, at_s).blended()[1][0, 0])
+        lost_m2 = sum(lost.variance_m2 for lost in self._lost if lost.time_s <= at_s)
+        return lost_m2 + float(self._filter.predicted(self._deployment, at_s).blended()[1][0, 0])
 
     def _is_echo(self, time_s: float, ran_away_m: Array, alone_m2: float) -> bool:
         """Return whether an answer that tells no variance may be our dead reckoning again.
@@ -238,5 +261,6 @@ class DriftCorrection:
             return False
         self.restarted += 1
         self._base, self._seen = self._deployment, []
+        self._filter_on([lost for lost in self._lost if lost.time_s > self._deployment.time_s])
         self._take(answer)
         return True

@@ -16,10 +16,11 @@ estimation, Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tra
 Navigation", 2001, section 11.6.2.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from firmware.dead_reckoning import FASTEST_LOST_MPS
 from firmware.geometry import Array
 from protocol.settings import Settings, setting
 
@@ -77,6 +78,22 @@ class RangeSeen:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class LostSpan:
+    """A span up to the time, of which nobody knows how far the vehicle went: its length."""
+
+    time_s: float
+    span_s: float
+
+    @property
+    def variance_m2(self) -> float:
+        """The variance of the way, each axis."""
+        return (FASTEST_LOST_MPS * self.span_s) ** 2
+
+
+Seen = AnswerSeen | RangeSeen | LostSpan
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class DriftState:
     """Means (W, 6) and covariances (W, 6, 6) of the bank at a time, and log weights (W,)."""
 
@@ -120,9 +137,12 @@ class DriftFilter:
         )
         return self.predicted(state, time_s)
 
-    def updated(self, state: DriftState, one: AnswerSeen | RangeSeen) -> DriftState:
+    def updated(self, state: DriftState, one: Seen) -> DriftState:
         """Return the state after something seen, at its time."""
         state = self.predicted(state, max(one.time_s, state.time_s))
+        if isinstance(one, LostSpan):
+            doubt_m2 = np.diag([one.variance_m2] * 2 + [0.0] * 4)
+            return replace(state, covariances=state.covariances + doubt_m2)
         seen = [
             self._innovation(mean, covariance, one)
             for mean, covariance in zip(state.means, state.covariances, strict=True)

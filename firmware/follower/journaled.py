@@ -45,8 +45,12 @@ class JournaledFollower(FollowerCore):
     def receive_odometry(self, odometry: Odometry) -> None:
         """Record and advance."""
         fresh = self.recorder.odometry(odometry)
-        if fresh is not None:
-            super().receive_odometry(fresh)
+        if fresh is None:
+            return
+        epoch = self.boot_epoch
+        super().receive_odometry(fresh)
+        if self.boot_epoch != epoch:
+            self.recorder.journal.count_epoch(self.boot_epoch)
 
     def receive_ping(self, ping: Ping) -> None:
         """Record and add a ping."""

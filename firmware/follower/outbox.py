@@ -20,7 +20,7 @@ class Outbox:
         self, vehicle: int, boot_epoch: int, settings: RepeatSettings, *, small_frames: bool
     ) -> None:
         self.counters: Counter[str] = Counter()
-        self._vehicle, self._boot_epoch = vehicle, boot_epoch
+        self._vehicle, self.boot_epoch = vehicle, boot_epoch
         self._profile = Profile.TRAJECTORY_SMALL if small_frames else Profile.TRAJECTORY
         self._queue = FragmentQueue(settings)
         self._trajectory_packets = 0
@@ -68,7 +68,7 @@ class Outbox:
         header = Header(
             profile=self._profile,
             vehicle=self._vehicle,
-            boot_epoch=self._boot_epoch,
+            boot_epoch=self.boot_epoch,
             submap=self._trajectory_packets,
             fragment=0,
             fragment_count=1,

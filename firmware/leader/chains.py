@@ -6,9 +6,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware.dead_reckoning import FASTEST_LOST_MPS
 from firmware.geometry import Array
 from firmware.leader.ledger import OdometryRecord, SharedWalkRecord
 from firmware.leader.trajectory import Trajectory
+
+_MOST_SPANS = 256  # of lost navigation; beyond it the oldest two become one, and what lies between
 
 
 @dataclass(slots=True)
@@ -17,7 +20,8 @@ class Chain:
 
     There is no clock where none is estimated.
 
-    `shape` is the estimate, as it was, of the part of which only some nodes are left.
+    `shape` is the estimate, as it was, of the part of which only some nodes are left. `lost` are
+    the spans, first and last second, of which nobody knows how far the vehicle went.
     """
 
     number: int
@@ -28,6 +32,24 @@ class Chain:
     keys: list[int] = field(default_factory=list)
     added: int = 0
     shape: Trajectory | None = None
+    lost: list[tuple[float, float]] = field(default_factory=list)
+
+    def lose(self, begin_s: float, end_s: float) -> None:
+        """Remember a span of which nobody knows how far the vehicle went; bounded."""
+        if self.lost and begin_s <= self.lost[-1][1]:
+            begin_s = self.lost.pop()[0]
+        self.lost.append((begin_s, end_s))
+        if len(self.lost) > _MOST_SPANS:
+            self.lost[:2] = [(self.lost[0][0], self.lost[1][1])]
+
+    def lost_m2(self, begin_s: float, end_s: float) -> float:
+        """Return the variance, each axis, that lost spans add to the way in an interval.
+
+        A vehicle mostly goes on as it went: since a span began sigma grows with the time itself,
+        not with its root.
+        """
+        ends_s = ((b, min(max(begin_s, b), e), min(max(end_s, b), e)) for b, e in self.lost)
+        return FASTEST_LOST_MPS**2 * sum((y - b) ** 2 - (x - b) ** 2 for b, x, y in ends_s)
 
     def key_at(self, time_s: float) -> int | None:
         """Return the key of the node at exactly this time, or None."""
@@ -80,6 +102,7 @@ class Chain:
         """Return dead reckoning between two nodes by their index."""
         interval_s = self.times_s[after] - self.times_s[before]
         variance_m2 = odometry_noise**2 * interval_s + bias_walk**2 * interval_s**3 / 3
+        variance_m2 += self.lost_m2(self.times_s[before], self.times_s[after])
         return OdometryRecord(
             origin=self.keys[before],
             target=self.keys[after],

@@ -103,6 +103,8 @@ class LeaderCore:
     def receive_odometry(self, odometry: Odometry) -> None:
         """Advance dead reckoning; a finished sub-map becomes a sheet of the atlas."""
         state = self._reckoning.receive_odometry(odometry)
+        if self._reckoning.lost_s > 0.0:
+            self._lose(state)
         self._builder.receive_state(state)
         if odometry.fix is not None:
             self._fixes.hold(odometry.time_s, odometry.fix)
@@ -258,6 +260,12 @@ class LeaderCore:
         for sheet_id in redundant(old, moves_m, self._settings.coverage):
             self.atlas.shelve(sheet_id)
         self.outlook.note(now_s)
+
+    def _lose(self, state: ReckonedState) -> None:
+        """Doubt the way since the last state, and forget the sub-map that it tears."""
+        self.graph.lose(LEADER, state.time_s - self._reckoning.lost_s, state.time_s)
+        self._builder.tear(state)
+        self._stretches.clear()
 
     def _add_own(self, stretch: Submap) -> None:
         """Join the newest stretches to a sub-map, so that one ends every hop."""

@@ -194,6 +194,7 @@ class Estimate:
         ahead_s = max(time_s - chain.times_s[-1], 0.0)
         carry = np.hstack([np.eye(2), -ahead_s * np.eye(2)])
         grown_m2 = s.odometry_noise**2 * ahead_s + self._walk**2 * ahead_s**3 / 3
+        grown_m2 += chain.lost_m2(chain.times_s[-1], time_s)
         covariance = self._newest_covariance[vehicle]
         return np.asarray(carry @ covariance @ carry.T + grown_m2 * np.eye(2))
 

@@ -108,6 +108,10 @@ class PoseGraph(Estimate):
                 added += 1
         return added
 
+    def lose(self, vehicle: int, begin_s: float, end_s: float) -> None:
+        """Say of a span, before it has nodes, that nobody knows how far a vehicle went in it."""
+        self._chains[vehicle].lose(begin_s, end_s)
+
     def add_closure(
         self, origin: Anchor, target: Anchor, offset_m: Array, covariance_m2: Array, *, active: bool
     ) -> int:

@@ -1,0 +1,121 @@
+"""Navigation that is away for a minute: what nobody measured is doubted, not believed."""
+
+import numpy as np
+import pytest
+
+from firmware.belief import Belief
+from firmware.follower.core import FollowerCore
+from firmware.leader.core import LeaderCore
+from firmware.soundings import Fix, Odometry
+from tests.leader.vessels import Convoy, follower_of, leader_of, line, sail
+
+LOST_S = (200.0, 260.0)
+
+
+def corner(time_s: float) -> tuple[float, float]:
+    """Return a way north that turns east while navigation is lost."""
+    return (2.0 * time_s, 60.0) if time_s < 220.0 else (440.0, 60.0 + 2.0 * (time_s - 220.0))
+
+
+def steer(core: FollowerCore | LeaderCore, time_s: float, how: str, fix: Fix | None = None) -> None:
+    """Feed navigation around the corner: there, without velocities, or not at all."""
+    is_lost = LOST_S[0] <= time_s < LOST_S[1]
+    if is_lost and how == "away":
+        return
+    velocity_mps = np.subtract(corner(time_s), corner(time_s - 0.25)) * 4.0
+    if is_lost and how == "without bottom":
+        velocity_mps = np.full(2, np.nan)
+    core.receive_odometry(
+        Odometry(
+            time_s=time_s,
+            velocity_north_mps=float(velocity_mps[0]),
+            velocity_east_mps=float(velocity_mps[1]),
+            yaw_rad=0.0 if time_s < 220.0 else np.pi / 2,
+            depth_m=10.0,
+            fix=fix,
+        )
+    )
+
+
+def chi_square(belief: Belief) -> float:
+    error_m = belief.position_m - corner(belief.time_s)
+    return float(error_m @ np.linalg.solve(belief.covariance_m2, error_m))
+
+
+@pytest.mark.parametrize("how", ["away", "without bottom"])
+def test_a_leader_doubts_where_it_is_and_believes_the_next_fix(how: str) -> None:
+    leader = leader_of(corner)
+    for quarter in range(1, 4 * 420 + 1):
+        now_s = quarter / 4.0
+        has_fix = now_s % 20.0 == 0.0 and not LOST_S[0] <= now_s <= 360.0
+        north_m, east_m = corner(now_s)
+        fix = Fix(vehicle=0, north_m=north_m, east_m=east_m, sigma_m=3.0) if has_fix else None
+        steer(leader, now_s, how, fix)
+        leader.tick(now_s)
+        if now_s in (270.0, 350.0):
+            assert np.hypot(*(leader.belief().position_m - corner(now_s))) > 50.0
+            assert chi_square(leader.belief()) < 6.0
+    assert "fixes_rejected" not in leader.status()
+    assert leader.belief().position_m == pytest.approx(corner(420.0), abs=10.0)
+    assert chi_square(leader.belief()) < 6.0
+
+
+def test_a_fix_while_navigation_is_lost_is_used() -> None:
+    leader = leader_of(corner)
+    for quarter in range(1, 4 * 270 + 1):
+        now_s = quarter / 4.0
+        fix = Fix(vehicle=0, north_m=440.0, east_m=120.0, sigma_m=3.0) if now_s == 250.0 else None
+        steer(leader, now_s, "without bottom", fix)
+        leader.tick(now_s)
+    assert leader.status()["fixes_used"] == 1
+    sigma_m = np.sqrt(leader.belief().covariance_m2[0, 0])
+    assert chi_square(leader.belief()) < 6.0
+    assert sigma_m < 120.0
+
+
+@pytest.mark.parametrize("how", ["away", "without bottom"])
+def test_a_follower_doubts_where_it_is_and_the_leader_does_too(how: str) -> None:
+    path = line(0.0, 0.0)
+    leader, follower = leader_of(path), follower_of(corner)
+    crew = Convoy(leader=leader, leader_path=path, followers={})
+    for quarter in range(1, 4 * 400 + 1):
+        now_s = quarter / 4.0
+        if LOST_S[0] <= now_s < LOST_S[1] or now_s > 265.0:
+            steer(follower, now_s, how)  # and no sonar: nothing but the way tells of the corner
+        else:
+            sail(follower, corner, now_s)
+        crew.run(now_s - 0.25, now_s)
+        follower.tick(now_s)
+        frame = follower.poll(now_s)
+        if frame is not None:
+            leader.receive_frame(frame, None, now_s + 1.0)
+    assert follower.status()["navigation_lost"] == 1
+    assert np.hypot(*(follower.belief().position_m - corner(400.0))) > 50.0
+    assert chi_square(follower.belief()) < 6.0
+    assert leader.status()["restarts"] == 1
+    newest = leader.fleet.newest_chain(1)
+    track = leader.fleet.track(newest)
+    at_s = float(track.time_s[-1])
+    assert at_s > 300.0
+    believed = Belief(
+        time_s=at_s,
+        position_m=leader.graph.position(leader.graph.anchor(newest, at_s, track)),
+        covariance_m2=leader.graph.predicted_covariance(newest, at_s),
+    )
+    assert np.hypot(*(believed.position_m - corner(at_s))) > 50.0
+    assert chi_square(believed) < 6.0
+
+
+def test_a_sub_map_is_not_joined_over_lost_navigation() -> None:
+    follower, leader = follower_of(corner), leader_of(corner)
+    for core in (follower, leader):
+        for quarter in range(1, 4 * 300 + 1):
+            now_s = quarter / 4.0
+            if LOST_S[0] <= now_s < LOST_S[1]:
+                steer(core, now_s, "without bottom")
+            else:
+                sail(core, corner, now_s)
+            core.tick(now_s)
+    spans = [(s.track.time_s[0], s.track.time_s[-1]) for s in leader.atlas]
+    assert all(end <= 206.0 or begin >= 259.0 for begin, end in spans)
+    assert any(begin >= 259.0 for begin, _ in spans)

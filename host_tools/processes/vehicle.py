@@ -65,6 +65,12 @@ class Aboard:
     voyage: Voyage
     truth_map: DepthMap
     files: VehicleFiles | None
+    clock: WallClock | ServedClock | None = None
+
+    def status(self) -> dict[str, int]:
+        """Return every counter of the loop, and of a clock that counts."""
+        counts = self.clock.status() if isinstance(self.clock, WallClock) else {}
+        return {**self.loop.status(), **counts}
 
 
 def run_vehicle(
@@ -148,10 +154,10 @@ def _report(aboard: Aboard, now_s: float, *, on_wall: bool) -> None:
     if now_s % STATUS_S != 0.0:
         return
     if aboard.files is not None:
-        aboard.files.write_counters(aboard.loop.status())
+        aboard.files.write_counters(aboard.status())
     if on_wall:
-        print(_status_line(now_s, aboard.loop.status()), file=sys.stderr)
-    for line in advice_lines(aboard.loop.status()):
+        print(_status_line(now_s, aboard.status()), file=sys.stderr)
+    for line in advice_lines(aboard.status()):
         print(line, file=sys.stderr)
 
 
@@ -183,7 +189,9 @@ def _board(
     in_real_time = isinstance(clock, WallClock) or clock.in_real_time
     worker: Worker = ThreadWorker() if in_real_time else InlineWorker()
     loop = _loop(core, modem, steps, worker, clock.now_s, voyage.tick_s)
-    aboard = Aboard(loop=loop, worker=worker, voyage=voyage, truth_map=truth_map, files=files)
+    aboard = Aboard(
+        loop=loop, worker=worker, voyage=voyage, truth_map=truth_map, files=files, clock=clock
+    )
     if isinstance(core, Journaled):
         _catch_up(aboard, core, passed, first_s, in_real_time=in_real_time)
     return aboard
@@ -282,9 +290,9 @@ def start_time_s(text: str) -> float:
 
 def _write(aboard: Aboard, voyage: Voyage) -> None:
     if aboard.files is None:
-        print(_status_line(voyage.settings.scenario.duration_s, aboard.loop.status()))
+        print(_status_line(voyage.settings.scenario.duration_s, aboard.status()))
         return
-    aboard.files.write_counters(aboard.loop.status())
+    aboard.files.write_counters(aboard.status())
     aboard.files.write_soundings(aboard.truth_map)
     core = aboard.loop.core
     if isinstance(core, LeaderCore):

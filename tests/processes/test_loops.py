@@ -1,3 +1,4 @@
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
@@ -187,20 +188,77 @@ def test_a_vehicle_whose_report_fails_sails_on(
     assert "no space left on device" in caplog.text
 
 
+class Wall:
+    """A computer's clock in true time, wrong by what is set; it sleeps by a monotonic one."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, utc_s: float) -> None:
+        self.true_s = utc_s
+        self.errors: list[tuple[float, float]] = []  # from when, how wrong
+        monkeypatch.setattr("firmware.clock.time.clock_gettime", lambda _: self.utc_s)
+        monkeypatch.setattr("firmware.clock.time.sleep", self.sleep)
+
+    @property
+    def utc_s(self) -> float:
+        past = [wrong_s for from_s, wrong_s in self.errors if from_s <= self.true_s]
+        return self.true_s + (past[-1] if past else 0.0)
+
+    def sleep(self, wait_s: float) -> None:
+        self.true_s += wait_s
+
+    def ticks(self, clock: WallClock) -> Iterator[tuple[float, float]]:
+        """Yield each tick with the true time at which it came; the work takes 10 ms."""
+        for now_s in clock.ticks(0.25):
+            yield now_s, self.true_s
+            self.true_s += 0.01
+
+
 def test_the_wall_clock_leaves_out_the_ticks_that_a_busy_loop_missed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    wall = {"s": 1000.0}
-    monkeypatch.setattr("firmware.clock.time.clock_gettime", lambda _: wall["s"])
-
-    def sleep(wait_s: float) -> None:
-        wall["s"] += wait_s
-
-    monkeypatch.setattr("firmware.clock.time.sleep", sleep)
+    wall = Wall(monkeypatch, 1000.0)
     clock = WallClock(start_utc_s=1000.25, end_s=2.0)
     seen = []
-    for now_s in clock.ticks(0.25):
+    for now_s, _ in wall.ticks(clock):
         seen.append(now_s)
-        wall["s"] += 0.8 if now_s == 0.5 else 0.01
+        wall.true_s += 0.8 if now_s == 0.5 else 0.0
     assert seen == [0.0, 0.25, 0.5, 1.5, 1.75, 2.0]
-    assert clock.skipped == 3
+    assert clock.status() == {"clock_ticks_skipped": 3, "clock_set_back": 0}
+
+
+@pytest.mark.parametrize("back_s", [0.6, 120.0, 3600.0])
+def test_a_wall_clock_that_is_set_back_goes_on_from_what_it_shows(
+    monkeypatch: pytest.MonkeyPatch, back_s: float
+) -> None:
+    wall = Wall(monkeypatch, 10_000.0)
+    wall.errors = [(10_010.1, -back_s)]
+    clock = WallClock(start_utc_s=5000.0)
+    came = list(itertools.islice(wall.ticks(clock), 80))
+    apart_s = np.diff([true_s for _, true_s in came])
+    assert apart_s.max() <= 0.75
+    for now_s, true_s in came[42:]:
+        assert now_s == pytest.approx(true_s - back_s - 5000.0, abs=0.02)
+    assert clock.status() == {"clock_ticks_skipped": 0, "clock_set_back": 1}
+
+
+def test_a_wall_clock_that_leaps_ahead_gives_no_burst_and_no_tick_of_the_past(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    wall = Wall(monkeypatch, 1000.0)
+    wall.errors = [(1005.1, 3600.0), (1006.0, 0.0)]
+    clock = WallClock(start_utc_s=1000.0)
+    came = list(itertools.islice(wall.ticks(clock), 60))
+    for now_s, true_s in came:
+        wrong_s = 3600.0 if 1005.1 <= true_s < 1006.0 else 0.0
+        assert now_s == pytest.approx(true_s + wrong_s - 1000.0, abs=0.02)
+    assert np.diff([true_s for _, true_s in came]).min() > 0.2
+    assert clock.status() == {"clock_ticks_skipped": 4 * 3600, "clock_set_back": 1}
+
+
+def test_a_wall_clock_waits_for_the_start_and_for_a_clock_that_is_slewed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    wall = Wall(monkeypatch, 1000.0)
+    wall.errors = [(1100.0 + k, -0.001 * k) for k in range(10)]
+    clock = WallClock(start_utc_s=1060.0, end_s=60.0)
+    assert [now_s for now_s, _ in wall.ticks(clock)] == [k * 0.25 for k in range(241)]
+    assert clock.status() == {"clock_ticks_skipped": 0, "clock_set_back": 0}

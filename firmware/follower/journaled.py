@@ -68,7 +68,7 @@ class JournaledFollower(FollowerCore):
         if not self.recorder.tick(now_s):
             return
         super().tick(now_s)
-        if now_s - self._checkpointed_s >= self.recorder.journal.settings.checkpoint_s:
+        if abs(now_s - self._checkpointed_s) >= self.recorder.journal.settings.checkpoint_s:
             self._checkpoint(now_s)
 
     def poll(self, now_s: float) -> bytes | None:

@@ -2,7 +2,8 @@
 
 After a restart the ports may repeat what the journal already holds: the sensors' last steps, frames
 that were taken but not acknowledged, the instant that was cut short. A repeat is answered as the
-first time, without the core.
+first time, without the core. It lies just before the journal's end; what is farther back in time
+comes by a clock that was set back, and is new.
 """
 
 import logging
@@ -30,6 +31,7 @@ from firmware.store_file import StoreUnusableError
 
 LOG = logging.getLogger(__name__)
 _NEVER_S = -float("inf")
+_REPEATED_S = 5.0  # before the journal's end; a commit a second leaves less to be repeated
 _HEARD_AGAIN = 256  # frames that a modem may hand over a second time: its own cap of events
 
 
@@ -67,7 +69,7 @@ class Recorder:
 
     def odometry(self, odometry: Odometry) -> Odometry | None:
         """Record navigation; None for what the journal already holds."""
-        if self._resumed_s is not None and odometry.time_s <= self.last_odometry_s:
+        if self._is_known(odometry.time_s, self.last_odometry_s):
             return None
         self.last_odometry_s = odometry.time_s
         self.journal.append(Kind.ODOMETRY, from_odometry(odometry))
@@ -75,7 +77,7 @@ class Recorder:
 
     def ping(self, ping: Ping) -> Ping | None:
         """Record a ping and return it as a replay will see it; None for a known one."""
-        if self._resumed_s is not None and ping.time_s <= self._last_ping_s:
+        if self._is_known(ping.time_s, self._last_ping_s):
             return None
         self._last_ping_s = ping.time_s
         fan, body = fan_of(ping), from_ping(ping)
@@ -97,8 +99,11 @@ class Recorder:
 
     def tick(self, now_s: float) -> bool:
         """Record an instant, and commit when it is time; False for a known one."""
-        if self._resumed_s is not None and now_s <= self.last_tick_s:
+        if self._is_known(now_s, self.last_tick_s):
             return False
+        if self._resumed_s is not None and now_s < self.last_tick_s:
+            self._resumed_s = None
+            self.journal.counters["store_clock_set_back"] += 1
         self.last_tick_s = now_s
         self.journal.append(Kind.TICK, from_instant(now_s))
         if abs(now_s - self._committed_s) >= self.journal.settings.commit_s:
@@ -112,10 +117,9 @@ class Recorder:
 
     def poll(self, now_s: float) -> bool:
         """Record that the core is asked for a frame; False when the answer is known."""
-        if self._resumed_s is not None:
-            if now_s <= self._polled[0]:
-                return False
-            self._resumed_s = None
+        if self._is_known(now_s, self._polled[0]):
+            return False
+        self._resumed_s = None
         self.journal.append(Kind.POLL, from_instant(now_s))
         self._polled = (now_s, None)
         return True
@@ -130,6 +134,10 @@ class Recorder:
             self._polled = (self._polled[0], frame)
             self.journal.commit()
         return frame
+
+    def _is_known(self, time_s: float, end_s: float) -> bool:
+        """Return whether the journal, which ends at a time, holds what comes after a restart."""
+        return self._resumed_s is not None and end_s - _REPEATED_S <= time_s <= end_s
 
     # checkpoints
 

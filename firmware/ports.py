@@ -12,6 +12,8 @@ from protocol.modems.base import Modem, Reception
 LOG = logging.getLogger(__name__)
 SensorStep = tuple[Odometry, Ping | None]
 _SAME_INSTANT_S = 1e-6
+_FAR_AHEAD_S = 2.0  # no sensor measures so far ahead of our clock
+_MOST_AHEAD = 64  # of them wait, a quarter of a minute of navigation; twice as many are looked at
 
 
 class Navigator(Protocol):
@@ -25,11 +27,18 @@ class Navigator(Protocol):
 
 
 class SensorPort:
-    """Hands a core the sensors' steps as their times come."""
+    """Hands a core the sensors' steps as their times come.
+
+    A step stamped far ahead of the clock waits like any other: it may be read in advance, or the
+    clock was set back. But those after it are looked at: where one is stamped for now, the earlier
+    ones were stamped wrongly. They are dropped and counted, and so are the oldest when too many
+    wait. Of steps read in advance, which have no end, none is lost.
+    """
 
     def __init__(self, steps: Iterator[SensorStep]) -> None:
         self._steps = steps
-        self._waiting: SensorStep | None = None
+        self._waiting: deque[SensorStep] = deque()
+        self.counters: Counter[str] = Counter()
 
     def feed(self, core: Navigator, now_s: float) -> None:
         """Give the core every step up to and including now."""
@@ -40,12 +49,35 @@ class SensorPort:
                 core.receive_ping(ping)
 
     def _next(self, now_s: float) -> SensorStep | None:
-        step = self._waiting if self._waiting is not None else next(self._steps, None)
-        if step is not None and step[0].time_s > now_s + _SAME_INSTANT_S:
-            self._waiting = step
+        waiting = self._waiting
+        if not waiting or _is_after(waiting[0], now_s + _FAR_AHEAD_S):
+            self._look_on(now_s)
+        if not waiting or _is_after(waiting[0], now_s + _SAME_INSTANT_S):
             return None
-        self._waiting = None
-        return step
+        return waiting.popleft()
+
+    def _look_on(self, now_s: float) -> None:
+        """Take what the sensors have, up to a step for now; drop what it leaves behind."""
+        while len(self._waiting) < 2 * _MOST_AHEAD:
+            step = next(self._steps, None)
+            if step is None:
+                self._keep(_MOST_AHEAD)
+                return
+            is_near = not _is_after(step, now_s + _FAR_AHEAD_S)
+            if is_near:
+                self._keep(0)
+            self._waiting.append(step)
+            if is_near:
+                return
+
+    def _keep(self, newest: int) -> None:
+        while len(self._waiting) > newest:
+            self._waiting.popleft()
+            self.counters["steps_from_the_future"] += 1
+
+
+def _is_after(step: SensorStep, time_s: float) -> bool:
+    return step[0].time_s > time_s
 
 
 class ModemPort:

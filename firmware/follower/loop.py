@@ -40,8 +40,13 @@ class FollowerLoop:
         self._executive.step(now_s)
 
     def status(self) -> dict[str, int]:
-        """Return every counter of core, link and executive."""
-        return {**self.core.status(), **self._link.status(), **self._executive.counters}
+        """Return every counter of core, sensors, link and executive."""
+        return {
+            **self.core.status(),
+            **self._sensors.counters,
+            **self._link.status(),
+            **self._executive.counters,
+        }
 
     def _hear(self, now_s: float) -> None:
         self._link.hear(self._receive, now_s)

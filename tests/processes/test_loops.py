@@ -67,6 +67,46 @@ def test_sensors_are_fed_up_to_now_and_no_further() -> None:
     assert core.times_s == [k * 0.25 for k in range(9)]
 
 
+class Sensor:
+    """Gives steps as they are measured, four a second, and none in advance."""
+
+    def __init__(self, stamps_s: list[float]) -> None:
+        self._stamps_s, self._given, self.now_s = stamps_s, 0, 0.0
+
+    def __iter__(self) -> "Sensor":
+        return self
+
+    def __next__(self) -> SensorStep:
+        if self._given > 4 * self.now_s:
+            raise StopIteration
+        self._given += 1
+        return odometry(self._stamps_s[self._given - 1]), None
+
+
+@pytest.mark.parametrize("wild", [1, 16, 200])
+@pytest.mark.parametrize("ahead_s", [3.0, 1e5, np.inf])
+def test_stamps_from_the_future_end_with_the_sensors_error(wild: int, ahead_s: float) -> None:
+    stamps_s = [0.25 * k + (ahead_s if 40 <= k < 40 + wild else 0.0) for k in range(400)]
+    sensor, core = Sensor(stamps_s), Notebook()
+    port = SensorPort(sensor)
+    for quarter in range(400):
+        sensor.now_s = quarter / 4
+        port.feed(core, sensor.now_s)
+    assert core.times_s[-(360 - wild) :] == stamps_s[40 + wild :]
+    dropped = port.counters["steps_from_the_future"]
+    assert len(core.times_s) + dropped == 400
+    assert dropped == wild or ahead_s == 3.0
+
+
+def test_steps_read_in_advance_are_not_lost_while_a_clock_is_set_back() -> None:
+    steps: Iterator[SensorStep] = ((odometry(k * 0.25), None) for k in range(4000))
+    port, core = SensorPort(steps), Notebook()
+    for quarter in (*range(800), *range(40, 3000)):
+        port.feed(core, quarter / 4)
+    assert core.times_s == [k * 0.25 for k in range(3000)]
+    assert not port.counters
+
+
 def test_what_goes_wrong_in_one_task_does_not_stop_the_others(
     caplog: pytest.LogCaptureFixture,
 ) -> None:

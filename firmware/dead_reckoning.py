@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from firmware.soundings import Odometry
 
+_SET_BACK_SAMPLES = 5  # back in time one after the other: it is the clock that was set back
 _LONGEST_STEP_S = 5.0  # a longer gap is not bridged with one velocity: the position is held
 FASTEST_LOST_MPS = 3.0
 """Sigma, each axis, of how far a survey vehicle goes while nobody measures it."""
@@ -32,6 +33,8 @@ class DeadReckoning:
         self.state = start
         self.bad_samples = 0
         self.lost_s = 0.0
+        self.set_back = 0
+        self._backward = 0
         self._velocity_mps = (0.0, 0.0)
         self._measured_s = start.time_s
 
@@ -39,13 +42,22 @@ class DeadReckoning:
         """Advance to the sample's time with its mean velocity since the last one; return the state.
 
         Non-finite velocities are replaced by the last good ones; samples that go back in time,
-        or carry no finite time, are dropped.
+        or carry no finite time, are dropped. Where they go on doing so, the clock was set back: the
+        position is held, and time goes on from there.
         """
         self.lost_s = 0.0
         interval_s = odometry.time_s - self.state.time_s
-        if not math.isfinite(interval_s) or interval_s < 0.0:
+        if not math.isfinite(interval_s):
             self.bad_samples += 1
             return self.state
+        if interval_s < 0.0:
+            self.bad_samples += 1
+            self._backward += 1
+            if self._backward < _SET_BACK_SAMPLES:
+                return self.state
+            self.set_back += 1
+            interval_s = 0.0
+        self._backward = 0
         velocity_mps = (odometry.velocity_north_mps, odometry.velocity_east_mps)
         if all(map(math.isfinite, velocity_mps)):
             self._velocity_mps, unmeasured_s = velocity_mps, interval_s

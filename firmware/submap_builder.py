@@ -56,7 +56,8 @@ class SubmapBuilder:
     def receive_state(self, state: ReckonedState) -> None:
         """Keep the state if its second is new; close the sub-map when its window is over."""
         window = self._window_of(state)
-        if self._window is not None and window != self._window:
+        is_back = bool(self._states) and state.time_s < self._states[-1].time_s  # clock set back
+        if self._window is not None and (window != self._window or is_back):
             self._close(state)
         self._window = window
         interval_s = self._settings.state_interval_s

@@ -84,6 +84,9 @@ class FollowerCore:
     def receive_odometry(self, odometry: Odometry) -> None:
         """Advance dead reckoning; a finished sub-map goes to the fit."""
         state = self._reckoning.receive_odometry(odometry)
+        while self._track and self._track[-1].time_s > state.time_s:  # the clock was set back
+            self._track.pop()
+            self._last_submap_s = min(self._last_submap_s, state.time_s)
         if self._reckoning.lost_s > 0.0:
             self._lose(state)
             return
@@ -165,6 +168,7 @@ class FollowerCore:
             **self._outbox.status(),
             "slots_missed": self._turns.missed,
             "bad_odometry": self._reckoning.bad_samples,
+            "odometry_set_back": self._reckoning.set_back,
             "bad_beams": self._builder.bad_beams,
             "bad_pings": self._builder.bad_pings,
             "submaps_overwritten": self._builder.submaps_overwritten,

@@ -109,7 +109,7 @@ class LeaderCore:
         if odometry.fix is not None:
             self._fixes.hold(odometry.time_s, odometry.fix)
         track = self.fleet.own
-        if state.time_s - self._tracked_s >= 1.0 - 1e-6:
+        if abs(state.time_s - self._tracked_s) >= 1.0 - 1e-6:  # back where a clock was set back
             self._tracked_s = state.time_s
             track.add(state.time_s, state.north_m, state.east_m, state.yaw_rad)
         submap = self._builder.take()
@@ -236,6 +236,7 @@ class LeaderCore:
             },
             "slots_missed": self._turns.missed,
             "bad_odometry": self._reckoning.bad_samples,
+            "odometry_set_back": self._reckoning.set_back,
             "bad_beams": self._builder.bad_beams,
             "bad_pings": self._builder.bad_pings,
             "submaps_overwritten": self._builder.submaps_overwritten,

@@ -84,6 +84,37 @@ def test_dead_reckoning_drops_samples_from_no_possible_time(time_s: float) -> No
     assert reckoning.bad_samples == 1
 
 
+@pytest.mark.parametrize("back_s", [3.0, 100.0, 1e5])
+def test_dead_reckoning_goes_on_when_its_clock_was_set_back(back_s: float) -> None:
+    reckoning = DeadReckoning(dataclasses.replace(START, time_s=back_s))
+    for k in range(1, 41):
+        reckoning.receive_odometry(odometry(0.25 * k))
+    assert reckoning.state.time_s == 10.0
+    assert reckoning.state.north_m - START.north_m == pytest.approx(20.0, abs=3.0)
+    assert (reckoning.set_back, reckoning.bad_samples) == (1, 5)
+
+
+def test_dead_reckoning_takes_single_late_samples_for_no_clock_set_back() -> None:
+    reckoning = DeadReckoning(START)
+    for k in range(1, 101):
+        for late_s in (0.0, 7.0, 7.0):
+            reckoning.receive_odometry(odometry(k - late_s))
+    assert reckoning.state.time_s == 100.0
+    assert reckoning.set_back == 0
+
+
+def test_builder_closes_a_submap_when_time_goes_back_within_its_window() -> None:
+    builder = SubmapBuilder(
+        1, 0, settings=SubmapSettings(), sonar=SonarSettings(), binning=BinningSettings()
+    )
+    tracks_s = []
+    for time_s in (*range(30), *range(10, 45)):
+        builder.receive_state(dataclasses.replace(START, time_s=float(time_s)))
+        submap = builder.take()
+        tracks_s += [] if submap is None else [submap.track.time_s.tolist()]
+    assert tracks_s == [list(range(30)), list(range(10, 40))]
+
+
 def test_builder_closes_a_submap_at_the_end_of_its_window_and_numbers_wrap() -> None:
     builder = SubmapBuilder(
         1,

@@ -306,6 +306,17 @@ def test_clock_that_is_set_back_does_not_silence_the_follower() -> None:
     assert sent(core, 130.0, begin_s=99.0)
 
 
+def test_track_that_is_told_after_a_clock_was_set_back_is_in_order() -> None:
+    core, path = follower_of(line(0.0, 0.0)), line(0.0, 0.0)
+    for time_s in (*np.arange(0.25, 300.0, 0.25), *np.arange(200.0, 210.0, 0.25)):
+        sail(core, path, float(time_s), sonar_on=False)
+    told_s = [state.time_s for state in core._idle_states()]
+    assert told_s == sorted(told_s)
+    assert 208.0 < told_s[-1] < 210.0
+    assert core.poll(210.0) is not None
+    assert core.status()["odometry_set_back"] == 1
+
+
 def test_navigation_that_fails_for_a_while_is_counted_and_goes_on() -> None:
     core = surveyed()
     core.receive_odometry(

@@ -44,9 +44,9 @@ def test_a_clock_behind_the_store_makes_no_vehicle_deaf_and_mute(
 ) -> None:
     core = resumed(folder)
     now_s = 120.0 - back_s
-    assert any(lived(core, now_s, now_s + 6.0))
-    assert core.recorder.last_tick_s == now_s + 6.0
-    assert core.recorder.last_odometry_s == now_s + 6.0
+    assert any(lived(core, now_s, now_s + 30.0))
+    assert core.recorder.last_tick_s == now_s + 30.0
+    assert core.recorder.last_odometry_s == now_s + 30.0
     assert core.status()["store_clock_set_back"] == 1
 
 

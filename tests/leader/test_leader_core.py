@@ -190,6 +190,20 @@ def test_navigation_between_whole_seconds_is_tracked_as_well() -> None:
     assert leader.graph.nodes >= 6  # of sub-maps that end every twenty seconds
 
 
+def test_own_track_goes_on_after_stamps_from_the_future() -> None:
+    path = line(0.0, 0.0)
+    leader = leader_of(path)
+    for k in range(4 * 200):
+        ahead_s = 3000.0 if 400 <= k < 404 else 0.0
+        sail(leader, line(-2.0 * ahead_s, 0.0), 0.25 * k + ahead_s, sonar_on=False)
+    assert leader.reckoned.time_s == 199.75
+    assert np.hypot(*(leader.belief().position_m - path(199.75))) < 6.0
+    track = leader.track(0)
+    assert (np.diff(track.time_s) > 0.0).all()
+    assert np.isin(np.arange(105.0, 199.0), np.round(track.time_s)).all()
+    assert leader.status()["odometry_set_back"] == 1
+
+
 def test_own_sub_map_does_not_reach_over_a_gap_in_navigation() -> None:
     path = line(0.0, 0.0)
     leader = leader_of(path, hop_s=10.0)

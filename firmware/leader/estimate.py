@@ -4,6 +4,7 @@ Nothing is told here; an estimate is brought up to its ledger by `update`, and w
 for a covariance.
 """
 
+import itertools
 from collections.abc import Mapping
 
 import numpy as np
@@ -27,6 +28,7 @@ from firmware.submaps import Track
 from protocol.errors import EstimationError
 
 _POSITION, _BIAS = slice(2), slice(2, 4)  # of a node's state
+_APART_AT_ONCE = 64  # nodes of a chain beside each other: fewer ask more often, more cost more
 
 
 class Estimate:
@@ -237,12 +239,20 @@ class Estimate:
         )
 
     def apart_m2(self, owners: Mapping[int, int]) -> dict[int, Array]:
-        """Return the covariance (2, 2) of the way between each node and its owner."""
-        keys = list(dict.fromkeys([*owners, *owners.values()]))
-        joint_m2 = self._joint_covariance(keys) if keys else np.zeros((0, 0))
-        rows = {key: (2 * k, 2 * k + 1) for k, key in enumerate(keys)}
-        ends = {key: (*rows[key], *rows[owner]) for key, owner in owners.items()}
-        return {key: offset_covariance(joint_m2[np.ix_(both, both)]) for key, both in ends.items()}
+        """Return the covariance (2, 2) of the way between each node and its owner.
+
+        They are asked for in batches of neighbours: the cost grows with the cube of what is joint.
+        """
+        nodes, apart_m2 = list(owners), dict[int, Array]()
+        for k in range(0, len(nodes), _APART_AT_ONCE):
+            ends = [(node, owners[node]) for node in nodes[k : k + _APART_AT_ONCE]]
+            keys = list(dict.fromkeys(itertools.chain.from_iterable(ends)))
+            joint_m2 = self._joint_covariance(keys)
+            rows = {key: (2 * row, 2 * row + 1) for row, key in enumerate(keys)}
+            for node, owner in ends:
+                both = (*rows[node], *rows[owner])
+                apart_m2[node] = offset_covariance(joint_m2[np.ix_(both, both)])
+        return apart_m2
 
     def _state(self, key: int) -> Array:
         return self._solver.state(key)

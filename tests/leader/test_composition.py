@@ -236,6 +236,31 @@ def test_composition_that_fails_leaves_the_graph_as_it_was(
     assert np.mean(voyage.misses_m(0)) < 3.0
 
 
+def test_ways_to_owners_are_asked_a_few_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph = Voyage(None, 3600).run(0, 3600).graph
+    owners = {
+        key: chain.keys[k // 6 * 6]
+        for chain in graph._chains.values()
+        for k, key in enumerate(chain.keys)
+        if k % 6
+    }
+    asked, covariance = [], graph._solver.covariance
+
+    def counted(keys: list[int], *, reckoned: bool = False) -> Array:
+        asked.append(len(keys))
+        return covariance(keys, reckoned=reckoned)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(graph._solver, "covariance", counted)
+        apart_m2 = graph.apart_m2(owners)
+    assert len(owners) == 600
+    assert max(asked) < 100
+    assert apart_m2.keys() == owners.keys()
+    for node, owner in list(owners.items())[::37]:
+        alone_m2 = graph.apart_m2({node: owner})[node]
+        np.testing.assert_allclose(apart_m2[node], alone_m2, rtol=1e-9, atol=1e-9)
+
+
 def test_closure_beyond_its_sigmas_is_not_taken_along() -> None:
     voyage = Voyage(None).run(0, 3600)
     track, true_m = voyage.tracks[0]

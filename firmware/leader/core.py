@@ -152,10 +152,11 @@ class LeaderCore:
         for sheet in self._arrivals.sheets(now_s):
             self._add_sheet(sheet)
         self._fixes.use(self.fleet, self.graph, now_s)
+        newest_s = self.graph.newest_s
         interval_s = self._settings.composition.interval_s
-        if now_s - self.composed_s >= interval_s and not self._closing.is_matching:
-            self.composed_s = now_s
-            self._compose(now_s)
+        if newest_s - self.composed_s >= interval_s and not self._closing.is_matching:
+            self.composed_s = newest_s
+            self._compose(newest_s)
 
     @property
     def has_jobs(self) -> bool:
@@ -249,18 +250,21 @@ class LeaderCore:
 
     # inside
 
-    def _compose(self, now_s: float) -> None:
-        """Make the past coarse, so that a day costs no more an hour than its first hours."""
+    def _compose(self, newest_s: float) -> None:
+        """Make the past coarse, so that a day costs no more an hour than its first hours.
+
+        It is the past of the newest node: a clock that leaps makes nothing old.
+        """
         settings = self._settings.composition
-        self.graph.compose(now_s, settings)
-        detail_s = detail_from_s(now_s, settings)
+        self.graph.compose(newest_s, settings)
+        detail_s = detail_from_s(newest_s, settings)
         self._closing.forget(detail_s)
         self.fleet.settle(detail_s)
         old = [sheet for sheet in self.atlas if sheet.time_s < detail_s]
         moves_m = corrections(old, self.graph)
         for sheet_id in redundant(old, moves_m, self._settings.coverage):
             self.atlas.shelve(sheet_id)
-        self.outlook.note(now_s)
+        self.outlook.note(newest_s)
 
     def _lose(self, state: ReckonedState) -> None:
         """Doubt the way since the last state, and forget the sub-map that it tears."""

@@ -54,6 +54,11 @@ class Estimate:
         return sum(len(chain.keys) for chain in self._chains.values())
 
     @property
+    def newest_s(self) -> float:
+        """The time of the newest node of all vehicles, whatever a clock says."""
+        return max(chain.times_s[-1] for chain in self._chains.values())
+
+    @property
     def wandering(self) -> Wandering:
         """How dead reckoning errs, as far as it is known by now."""
         apart = self._settings.walk_apart * self._walk

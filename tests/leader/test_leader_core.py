@@ -181,6 +181,23 @@ def test_clock_that_is_set_back_does_not_silence_the_leader() -> None:
     assert any(one.leader.poll(103.0 + k) for k in range(20))
 
 
+def test_clock_that_leaps_ahead_neither_stops_composition_nor_coarsens_the_present() -> None:
+    path = line(0.0, 0.0)
+    leader = leader_of(path)
+    composed_s = []
+    for second in range(1, 1900):
+        sail(leader, path, float(second), sonar_on=False)
+        leader.tick(float(second))
+        if second == 1000:
+            before = leader.graph.nodes
+            leader.tick(1000.0 + 7 * 3600.0)
+            assert leader.graph.nodes == before
+        if leader.composed_s not in composed_s:
+            composed_s.append(leader.composed_s)
+    assert composed_s == [0.0, 600.0, 1200.0, 1800.0]
+    assert len(leader.graph.trajectory(0).time_s) > leader.graph.nodes > 1200 / 10
+
+
 def test_navigation_between_whole_seconds_is_tracked_as_well() -> None:
     path = line(0.0, 0.0)
     leader = leader_of(path)

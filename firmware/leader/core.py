@@ -152,20 +152,18 @@ class LeaderCore:
         for sheet in self._arrivals.sheets(now_s):
             self._add_sheet(sheet)
         self._fixes.use(self.fleet, self.graph, now_s)
-        newest_s = self.graph.newest_s
-        interval_s = self._settings.composition.interval_s
-        if newest_s - self.composed_s >= interval_s and not self._closing.is_matching:
-            self.composed_s = newest_s
-            self._compose(newest_s)
+        if self._is_to_compose and not self._closing.is_matching:
+            self.composed_s = self.graph.newest_s
+            self._compose(self.composed_s)
 
     @property
     def has_jobs(self) -> bool:
-        """Whether a sheet waits for its matches."""
-        return self._closing.has_jobs
+        """Whether a sheet waits for its matches, and composition does not wait for those out."""
+        return self._closing.has_jobs and not self._is_to_compose
 
     def next_jobs(self) -> SheetJobs | None:
         """Return the matches of the oldest sheet that still waits for them, or None."""
-        return self._closing.next_jobs()
+        return self._closing.next_jobs() if self.has_jobs else None
 
     def finish(self, done: SheetJobs, findings: Findings, now_s: float) -> None:
         """Judge what the matches of one sheet found, and bring the estimate up to it."""
@@ -249,6 +247,11 @@ class LeaderCore:
         }
 
     # inside
+
+    @property
+    def _is_to_compose(self) -> bool:
+        """Whether the past is to be composed as soon as no matches are out."""
+        return self.graph.newest_s - self.composed_s >= self._settings.composition.interval_s
 
     def _compose(self, newest_s: float) -> None:
         """Make the past coarse, so that a day costs no more an hour than its first hours.

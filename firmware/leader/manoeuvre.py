@@ -141,8 +141,10 @@ def relief_information(
     """Return what a match on half of a grid (R, C) would tell of a shift, (2, 2) in 1/m^2.
 
     Each cell tells along its slope; a few dozen cells err together, and no match is better than
-    the floor.
+    the floor. A single row or column has no slopes.
     """
+    if min(depth_m.shape) < 2:
+        return np.zeros((2, 2))
     north, east = np.gradient(depth_m, cell_m)
     slopes = np.stack([north.ravel(), east.ravel()])
     slopes = slopes[:, np.isfinite(slopes).all(axis=0)]

@@ -1,5 +1,7 @@
 """What the leader's estimate leaves open, and the manoeuvre that would tell most of it."""
 
+import logging
+
 import numpy as np
 
 from firmware.geometry import Array
@@ -20,13 +22,17 @@ from firmware.submaps import GriddedSubmap
 from protocol.errors import EstimationError
 from protocol.vehicles import name_of
 
+LOG = logging.getLogger(__name__)
 MOST_GROUND = 32  # sub-maps whose joint covariance is asked for
 APART_M = 60.0  # nearer ones tell the same
 _VELOCITY_OVER_S = 20.0
 
 
 class Outlook:
-    """What can be said of the newest states of all vehicles, and of how to know them better."""
+    """What can be said of the newest states of all vehicles, and of how to know them better.
+
+    Remarks only: what keeps them from being made stops neither a composition nor a record.
+    """
 
     def __init__(
         self,
@@ -53,6 +59,9 @@ class Outlook:
             return observe(now_s, names, np.array(positions_m), joint, reckoned)
         except (EstimationError, np.linalg.LinAlgError):
             return None
+        except Exception:
+            LOG.exception("what the geometry leaves open was not found")
+            return None
 
     def note(self, now_s: float) -> None:
         """Keep what is to be observed now for the status."""
@@ -66,6 +75,9 @@ class Outlook:
             )
             return propose(situation, self._settings)
         except (EstimationError, np.linalg.LinAlgError):
+            return None
+        except Exception:
+            LOG.exception("no manoeuvre was found")
             return None
 
     def status(self) -> dict[str, int]:

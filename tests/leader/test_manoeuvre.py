@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from firmware.geometry import Array
+from firmware.leader import outlook
 from firmware.leader.manoeuvre import (
     Ground,
     ManoeuvreSettings,
@@ -15,6 +16,7 @@ from firmware.leader.manoeuvre import (
     relief_information,
 )
 from firmware.leader.wander import Wandering
+from tests.leader.vessels import sailed
 
 SETTINGS = ManoeuvreSettings()
 WANDERING = Wandering(noise=0.2, walk=0.002, apart=0.0007)
@@ -72,6 +74,27 @@ def test_holes_in_a_grid_tell_nothing() -> None:
     holed[:, 15:] = np.nan
     whole, half = (relief_information(d, 2.0, 0.02, SETTINGS) for d in (depth_m, holed))
     assert np.trace(half) < np.trace(whole)
+
+
+@pytest.mark.parametrize("shape", [(1, 40), (40, 1), (1, 1)])
+def test_single_row_of_cells_tells_nothing(shape: tuple[int, int]) -> None:
+    told = relief_information(np.full(shape, 50.0), 2.0, 0.02, SETTINGS)
+    np.testing.assert_array_equal(told, np.zeros((2, 2)))
+    assert propose(lost((-400.0, 0.0), tells=told), SETTINGS) is None
+
+
+def test_remark_that_cannot_be_made_is_logged_and_raises_nothing(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fails(*_: object) -> None:
+        raise ValueError("a bug")
+
+    leader = sailed(50.0)
+    for part in ("observe", "situation_of"):
+        monkeypatch.setattr(outlook, part, fails)
+    assert leader.outlook.observe(50.0) is None
+    assert leader.outlook.propose() is None
+    assert caplog.text.count("ValueError: a bug") == 2
 
 
 def test_expected_sigma_without_measurements_is_that_of_dead_reckoning() -> None:

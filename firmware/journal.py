@@ -134,12 +134,14 @@ class Journal:
         packed = self._file.checkpoint()
         return None if packed is None else zlib.decompress(packed)
 
-    def put(self, name: str, body: bytes) -> None:
-        """Put away what is wanted seldom; a disk that does not take it loses it, counted."""
+    def put(self, name: str, body: bytes) -> bool:
+        """Put away what is wanted seldom; return whether the disk took it: if not, counted."""
         try:
             self._file.put(name, body)
         except sqlite3.Error:
-            self.counters["store_shelf_lost"] += 1
+            self.counters["store_shelf_refused"] += 1
+            return False
+        return True
 
     def drop(self, name: str) -> None:
         """Throw away what was put away; where the disk does not allow it, it stays, counted."""

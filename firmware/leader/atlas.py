@@ -103,6 +103,7 @@ def overlap_m2(origin: Sheet, target: Sheet, shifts_m: Array) -> Array:
 class Atlas:
     """Sheets to match with, by id in the order of their arrival; the others are on the shelf.
 
+    What the shelf refuses stays in memory, packed, and so in checkpoints.
     The oldest leave for good when there are more than the cap of all together.
     """
 
@@ -111,6 +112,7 @@ class Atlas:
         self._sheets: OrderedDict[SheetId, Sheet] = OrderedDict()
         self._shelved: OrderedDict[SheetId, None] = OrderedDict()
         self.shelf = MemoryShelf() if shelf is None else shelf
+        self._refused = MemoryShelf()
         self.dropped = 0
 
     def __getstate__(self) -> dict[str, Any]:
@@ -148,17 +150,21 @@ class Atlas:
 
     def shelve(self, sheet_id: SheetId) -> None:
         """Put a sheet away: it is matched no more, but stays part of the map."""
-        self.shelf.put(_name(sheet_id), packed(self._sheets.pop(sheet_id).grid))
+        name, body = _name(sheet_id), packed(self._sheets.pop(sheet_id).grid)
+        if not self.shelf.put(name, body):
+            self._refused.put(name, body)
         self._shelved[sheet_id] = None
 
     def _unshelve(self, sheet_id: SheetId) -> None:
         del self._shelved[sheet_id]
-        self.shelf.drop(_name(sheet_id))
+        for shelf in (self.shelf, self._refused):
+            shelf.drop(_name(sheet_id))
 
     def grids(self) -> Iterator[tuple[int, GriddedSubmap]]:
         """Yield vehicle and grid of every sheet that can be had, those of the shelf first."""
         for sheet_id in self._shelved:
-            body = self.shelf.get(_name(sheet_id))
+            name = _name(sheet_id)
+            body = self._refused.get(name) or self.shelf.get(name)
             if body is not None:
                 yield sheet_id.vehicle, unpacked(body)
         for sheet in self:

@@ -13,8 +13,8 @@ _HEAD = np.dtype([("north0_m", "<f8"), ("east0_m", "<f8"), ("cell_m", "<f8"), ("
 class Shelf(Protocol):
     """Packed grids by name."""
 
-    def put(self, name: str, body: bytes) -> None:
-        """Keep a body; a second one under the name takes its place."""
+    def put(self, name: str, body: bytes) -> bool:
+        """Keep a body, in place of an earlier one of the name; return whether it could be."""
 
     def get(self, name: str) -> bytes | None:
         """Return a body, or None if it is lost."""
@@ -29,9 +29,10 @@ class MemoryShelf:
     def __init__(self) -> None:
         self._bodies: dict[str, bytes] = {}
 
-    def put(self, name: str, body: bytes) -> None:
+    def put(self, name: str, body: bytes) -> bool:
         """Keep a body."""
         self._bodies[name] = body
+        return True
 
     def get(self, name: str) -> bytes | None:
         """Return a body."""

@@ -227,6 +227,19 @@ def test_full_disk_is_counted_and_healed_without_a_gap(tmp_path: Path) -> None:
     assert list(opened(tmp_path).replay()) == [*((1, body) for body in NOISE), (2, b"room again")]
 
 
+def test_full_and_lost_stores_say_that_they_put_nothing_away(tmp_path: Path) -> None:
+    journal = opened(tmp_path, waiting_bytes=1000)
+    assert journal.put("kept", b"body")
+    full(journal, 0)
+    assert not journal.put("too large", NOISE[0])
+    for body in NOISE:
+        journal.append(1, body)
+        journal.commit()
+    assert journal.counters["store_lost"] == 1
+    assert not journal.put("too late", b"body")
+    assert journal.counters["store_shelf_refused"] == 2
+
+
 def test_disk_that_stays_full_ends_the_store_in_bounded_memory(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -1,5 +1,6 @@
 """What keeps a long mission's memory bounded: packed sub-maps, covered places, rows of closures."""
 
+import pickle
 from typing import cast
 
 import numpy as np
@@ -103,6 +104,31 @@ def test_what_the_atlas_drops_leaves_its_shelf() -> None:
         atlas.shelve(SheetId(vehicle=0, boot_epoch=0, submap=submap))
     assert atlas.dropped == 3
     assert [shelf.get(f"0/0/{submap}") is None for submap in range(6)] == [True] * 3 + [False] * 3
+
+
+class FullShelf(MemoryShelf):
+    """Takes one body, and no more."""
+
+    def put(self, name: str, body: bytes) -> bool:
+        return not self._bodies and super().put(name, body)
+
+
+def test_what_the_shelf_refuses_stays_part_of_the_map_and_of_a_checkpoint() -> None:
+    shelf = FullShelf()
+    atlas = Atlas(3, shelf)
+    sheets = [sheet_at(0.0, submap) for submap in range(3)]
+    for sheet in sheets:
+        atlas.add(sheet)
+        atlas.shelve(sheet.id)
+    resumed = pickle.loads(pickle.dumps(atlas))
+    resumed.shelf = shelf
+    for each in (atlas, resumed):
+        depths_m = [grid.depth_m for _, grid in each.grids()]
+        for depth_m, sheet in zip(depths_m, sheets, strict=True):
+            np.testing.assert_allclose(depth_m, sheet.grid.depth_m, atol=1e-4)
+    for submap in range(3, 6):
+        atlas.add(sheet_at(0.0, submap))
+    assert not any(each.get("0/0/1") for each in (shelf, atlas._refused))
 
 
 def test_a_match_that_fails_is_a_reason_not_the_end_of_its_batch(

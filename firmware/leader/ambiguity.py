@@ -31,7 +31,18 @@ _FLUCTUATIONS = 1.5  # sigmas of a mean square by which two right shifts may dif
 _LEAST_FLUCTUATION = 0.2  # noise is not known to better than that
 _UNSTRAINED_MISFIT = 0.8  # what the noise model alone leaves at the best shift, or less
 LEAST_MISFIT = 0.5  # noise is seldom less than half of what is assumed
+_LEAST_RIDGE = 5  # shifts that fit; fewer have no direction
+_RIDGE_SIGMA_RAD = 0.01  # of its direction: half a degree of heading between two passes
+_PRIOR_DOUBTED = 3.0  # sigmas of it, where a ridge's direction still has to hold
 _LEAST_GAIN = 0.3  # f(1) of a background of 2.3; below it the surface hardly has a minimum
+
+
+class Ridge(NamedTuple):
+    """Where shifts slide that fit alike: across which axis, how surely, and how far it bends."""
+
+    axis: Array  # (2,) unit vector across the ridge
+    sigma_rad: float
+    strayed_m2: float  # mean square distance of the ridge from its line
 
 
 class Prior(NamedTuple):
@@ -123,16 +134,18 @@ def tempered_evidence(surface: ErrorSurface, relief: Relief, correlated_cells: f
     cells count as one. Unlike `log_evidence` it makes a larger overlap pay for every cell that
     does not fit, so that its moments stay honest where the relief is faint.
     """
-    usable = np.isfinite(surface.residual_m2)
-    error = np.where(usable, surface.residual_m2 / surface.noise_m2, np.inf) / relief.noise_scale
     cells = np.minimum(surface.overlap_cells, relief.coherent_cells)
-    misfit = (
-        surface.overlap_cells
-        * np.where(usable, np.maximum(error - 1.0, 0.0), 0.0)
-        / (2.0 * correlated_cells)
-    )
+    misfit = misfit_of(surface, relief.noise_scale, correlated_cells)
     evidence = 0.5 * relief.information_per_cell * cells - misfit
-    return np.where(usable, np.maximum(evidence, 0.0), -np.inf)
+    return np.where(np.isfinite(misfit), np.maximum(evidence, 0.0), -np.inf)
+
+
+def misfit_of(surface: ErrorSurface, noise_scale: float, correlated_cells: float) -> Array:
+    """Return what speaks against each shift, in nats; infinity where there is no overlap."""
+    usable = np.isfinite(surface.residual_m2)
+    error = np.where(usable, surface.residual_m2, 0.0) / surface.noise_m2 / noise_scale
+    nats = surface.overlap_cells * np.maximum(error - 1.0, 0.0) / (2.0 * correlated_cells)
+    return np.where(usable, nats, np.inf)
 
 
 def moments(found: Posterior, prior: Prior) -> tuple[Array, Array]:
@@ -178,30 +191,42 @@ def posterior(surface: ErrorSurface, evidence: Array, prior: Prior, null_share: 
     )
 
 
-def strayed_m2(
+def ridge_of(
     surface: ErrorSurface, limit: float, prior: Prior, winner_m: Array, axis: Array
-) -> float:
-    """Return the mean square by which a ridge leaves the line through the winner, across the axis.
+) -> Ridge:
+    """Return the line along which shifts go on fitting from the winner, about across the axis.
 
-    Contours of the seabed bend: a closure that slides along one holds at the winner, but the line
-    goes on to where the prior expects the shift. Of the shifts abreast of each other the best
-    stands for the ridge if its misfit is within the limit; the prior says how much it counts.
+    Of the shifts abreast of each other the best stands for the ridge if its misfit is within the
+    limit. A line is fitted to as much of it as a prior three times as wide allows: its direction
+    has to hold where the prior may be wrong. How much of the rest counts is for the prior to say.
     """
     misfit = surface.residual_m2 / surface.noise_m2
     row, column = np.nonzero(np.isfinite(misfit) & (misfit <= limit))
-    if row.size == 0:
-        return 0.0
+    if row.size < _LEAST_RIDGE:
+        return Ridge(axis=axis, sigma_rad=_RIDGE_SIGMA_RAD, strayed_m2=0.0)
     cell_m = float(surface.north_m[1] - surface.north_m[0])
     shifts_m = np.stack([surface.north_m[row], surface.east_m[column]])
     from_winner_m = shifts_m - winner_m[:, None]
-    abreast = np.round(np.array([-axis[1], axis[0]]) @ from_winner_m / cell_m)
+    line = np.array([-axis[1], axis[0]])
+    abreast = np.round(line @ from_winner_m / cell_m)
     order = np.lexsort((misfit[row, column], abreast))
     ridge = order[np.unique(abreast[order], return_index=True)[1]]
     away_m = shifts_m[:, ridge] - prior.mean_m[:, None]
     square = np.sum(away_m * np.linalg.solve(prior.covariance_m2, away_m), axis=0)
-    weight = np.exp(-0.5 * (square - square.min()))
-    strayed = float(np.average((axis @ from_winner_m[:, ridge]) ** 2, weights=weight))
-    return max(strayed - cell_m**2 / 6.0, 0.0)  # which the lattice itself makes
+    square -= square.min()
+    along, across = line @ from_winner_m[:, ridge], axis @ from_winner_m[:, ridge]
+    wide = np.exp(-0.5 * square / _PRIOR_DOUBTED**2)
+    spread_m2 = float(wide @ along**2)
+    tilt = float(wide @ (along * across)) / max(spread_m2, cell_m**2)
+    off_m = across - tilt * along
+    sigma_rad = np.sqrt(float(wide @ off_m**2) / wide.sum() / max(spread_m2, cell_m**2))
+    turned = axis - tilt * line
+    strayed = float(np.average(off_m**2, weights=np.exp(-0.5 * square)))
+    return Ridge(
+        axis=turned / np.hypot(*turned),
+        sigma_rad=float(np.hypot(sigma_rad, _RIDGE_SIGMA_RAD)),
+        strayed_m2=max(strayed - cell_m**2 / 6.0, 0.0),  # which the lattice itself makes
+    )
 
 
 def judge(found: Posterior, winner_m: Array, radius_m: float) -> Verdict:

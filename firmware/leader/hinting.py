@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from firmware.geometry import Array
 from firmware.leader import ambiguity
 from firmware.leader.ambiguity import Prior, Relief
 from firmware.leader.matches import Hint
@@ -14,6 +15,10 @@ _WARPED_NOISE = 0.35  # of the cells' variance: taking drift out of a grid avera
 _TOLERANCE = 1.2  # of the best misfit: a hint tells a region of shifts, not one
 _NOTHING_GAINED = 0.95  # share of the prior's variance left: that axis is as unknown as before
 _LONGEST_SIGMAS = np.pi  # of the prior: the longest wave that tells its shifts apart
+_PROFILE_SIGMAS = 0.25  # of a region, between shifts whose misfits are held side by side
+_MOST_BINS = 160  # of a profile: forty sigmas of the region
+_LEAST_SHARE = 1e-6  # of the prior's variance that a region has left, for its own scale
+_CONTRADICTION = 2.0  # nats of misfit that end a region
 _NO_INFORMATION = 1e4  # variances of the prior
 
 
@@ -24,27 +29,57 @@ def hint_of(
     if not np.isfinite(surface.residual_m2).any():
         return None
     settings, surface = problem.settings, problem.strained(surface)
-    evidence = ambiguity.tempered_evidence(
-        surface, _cautious(problem, surface, relief, prior), problem.correlated_cells
-    )
+    cautious = _cautious(problem, surface, relief, prior)
+    evidence = ambiguity.tempered_evidence(surface, cautious, problem.correlated_cells)
     found = ambiguity.posterior(surface, evidence, prior, settings.null_share)
     mean_m, covariance_m2 = ambiguity.moments(found, prior)
     root = np.linalg.cholesky(prior.covariance_m2)
     inverse = np.linalg.inv(root)
     left, axes = np.linalg.eigh(inverse @ covariance_m2 @ inverse.T)  # shares of the prior
-    if left[0] > settings.hint_gain:
+    misfit = ambiguity.misfit_of(surface, cautious.noise_scale, problem.correlated_cells)
+    sigmas = np.sqrt(np.maximum(left, _LEAST_SHARE))
+    away = axes.T @ inverse @ _shifts_from(surface, mean_m) / sigmas[:, None]
+    closed = np.array([_is_closed(away[k], away[1 - k], misfit.ravel()) for k in (0, 1)])
+    gained = closed & (left < _NOTHING_GAINED)
+    if not gained.any() or left[gained].min() > settings.hint_gain:
         return None
-    gained = left < _NOTHING_GAINED
     share = np.where(gained, left / np.maximum(1.0 - left, 1e-3), 1.0)
     moved = axes.T @ inverse @ (mean_m - prior.mean_m)
-    away = np.where(gained, moved / np.maximum(1.0 - left, 1e-3), 0.0)
-    sigmas = np.where(gained, share, _NO_INFORMATION)
+    steps = np.where(gained, moved / np.maximum(1.0 - left, 1e-3), 0.0)
     frame = root @ axes
-    told_m2 = settings.hint_scale * frame @ np.diag(sigmas) @ frame.T
+    told = np.where(gained, settings.hint_scale * share, _NO_INFORMATION)
     return Hint(
-        shift_m=prior.mean_m + frame @ away,
-        covariance_m2=told_m2 + settings.hint_floor_m**2 * np.eye(2),
+        shift_m=prior.mean_m + frame @ steps,
+        covariance_m2=frame @ np.diag(told) @ frame.T + settings.hint_floor_m**2 * np.eye(2),
     )
+
+
+def _shifts_from(surface: ErrorSurface, mean_m: Array) -> Array:
+    """Return all shifts of a surface (2, K L) from a mean."""
+    north, east = np.meshgrid(
+        surface.north_m - mean_m[0], surface.east_m - mean_m[1], indexing="ij"
+    )
+    return np.stack([north.ravel(), east.ravel()])
+
+
+def _is_closed(along: Array, across: Array, misfit: Array) -> bool:
+    """Return whether misfit ends the region of likely shifts on both its sides along an axis.
+
+    along and across (K,) are in sigmas of the region. Where it goes on as far as the sub-maps
+    overlap, as along a ridge or a straight slope, it may go on beyond as well: that they overlap
+    at all is then no more than a guess.
+    """
+    band = (np.abs(across) <= 1.0) & np.isfinite(misfit)
+    for side in (along[band], -along[band]):
+        ahead = side > 0.0
+        if not ahead.any():
+            return False
+        bins = np.minimum(side[ahead] / _PROFILE_SIGMAS, _MOST_BINS - 1).astype(np.intp)
+        least = np.full(_MOST_BINS, np.inf)
+        np.minimum.at(least, bins, misfit[band][ahead])
+        if not np.any(least[np.isfinite(least)] >= _CONTRADICTION):
+            return False
+    return True
 
 
 def _cautious(problem: PairProblem, surface: ErrorSurface, relief: Relief, prior: Prior) -> Relief:

@@ -18,6 +18,8 @@ from firmware.leader.screening import ErrorSurface
 from firmware.submaps import GriddedSubmap
 from protocol.errors import EstimationError
 
+_FREE_M = 1e4  # of a one-axis closure across it: nothing, however often it is said
+_DOUBTED = 3.0  # sigmas of the prior by which a one-axis closure may have to slide
 _NEGLIGIBLE = 1e-6  # mass beside the best lattice shift's that is not worth refining
 
 __all__ = ["Hint", "Match", "MatchOutcome", "MatchingSettings", "NoMatch", "match"]
@@ -244,12 +246,13 @@ def _decide(
         false_mass = verdict.false_mass_off_line
     else:
         return _none(NoMatch.AMBIGUOUS)
-    along = float(axis @ covariance @ axis)
-    along += ambiguity.strayed_m2(*ridge, prior, refined.shift_m, axis)
+    line = ambiguity.ridge_of(*ridge, prior, refined.shift_m, axis)
+    axis, across = line.axis, np.array([-line.axis[1], line.axis[0]])
+    slide_m2 = _DOUBTED**2 * float(across @ prior.covariance_m2 @ across)
+    along = float(axis @ covariance @ axis) + line.strayed_m2 + line.sigma_rad**2 * slide_m2
     if along > settings.sigma_limit_m**2:
         return _none(NoMatch.LOOSE)
-    across = np.array([-axis[1], axis[0]])
-    wide = along * np.outer(axis, axis) + settings.search_cap_m**2 * np.outer(across, across)
+    wide = along * np.outer(axis, axis) + _FREE_M**2 * np.outer(across, across)
     axis_deg = float(np.degrees(np.arctan2(axis[1], axis[0])) % 180.0)
     return _closure(refined, residual, evidence, wide + walk, axis_deg, false_mass)
 

@@ -49,3 +49,31 @@ def test_closure_leaves_no_hint_beside_it(scene: Scene) -> None:
     outcome = match(reference, query, np.zeros(2), PRIOR_M2, STILL)
     assert outcome.match is not None
     assert outcome.hint is None
+
+
+def test_a_straight_ridge_tells_no_hint_how_far_along_it_sub_maps_lie() -> None:
+    """They fit as far as they overlap, and the ridge goes on: that they overlap is a guess."""
+    normal = np.array([np.cos(1.07), np.sin(1.07)])
+    along = np.array([-normal[1], normal[0]])
+
+    def ridge_m(north_m: Array, east_m: Array) -> Array:
+        off_m = normal[0] * (north_m - 240.0) + normal[1] * (east_m - 190.0)
+        return np.asarray(60.0 - 25.0 * np.exp(-0.5 * (off_m / 60.0) ** 2))
+
+    prior_m2, hints = 60.0**2 * np.eye(2), 0
+    for seed in range(6):
+        scene = Scene(seed)
+        truth_m = scene.rng.normal(0.0, 60.0, 2)
+        reference = scene.submap(200, 130, (41, 60), relief=ridge_m)
+        query = scene.submap(210, 150, (41, 60), shift_m=(truth_m[0], truth_m[1]), relief=ridge_m)
+        outcome = match(reference, query, np.zeros(2), prior_m2, STILL)
+        if outcome.match is not None:
+            assert along @ outcome.match.covariance_m2 @ along > 1000.0**2
+        hint = outcome.hint
+        if hint is None:
+            continue
+        hints += 1
+        left_m2 = np.linalg.inv(np.linalg.inv(prior_m2) + np.linalg.inv(hint.covariance_m2))
+        assert along @ left_m2 @ along > 0.9 * 60.0**2
+        assert normal @ left_m2 @ normal < 0.5 * 60.0**2
+    assert hints >= 2

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from firmware.leader.ambiguity import Prior, strayed_m2
+from firmware.leader.ambiguity import Prior, ridge_of
 from firmware.leader.atlas import SheetId, sheet_of
 from firmware.leader.drifts import AGE_S
 from firmware.leader.matching import MatchingSettings, match
@@ -125,6 +125,23 @@ def test_one_axis_closure_knows_how_its_contour_bends(
         depth_offset_m=np.zeros(off_m.shape),
     )
     prior = Prior(np.array([0.0, 10.0]), 225.0 * np.eye(2))
-    found_m2 = strayed_m2(surface, 1.0, prior, np.zeros(2), axis)
+    found_m2 = ridge_of(surface, 1.0, prior, np.zeros(2), axis).strayed_m2
     assert (found_m2 > 4.0) is strays
     assert strays or found_m2 < 0.5
+
+
+def test_one_axis_closure_has_the_axis_of_the_whole_ridge_not_of_what_the_prior_leaves() -> None:
+    """A few degrees beside it, it would be metres off where the prior is wrong by three sigmas."""
+    right, about = (np.array([np.cos(at), np.sin(at)]) for at in (1.07, 1.17))
+    off_m = right[0] * CROSS_M[:, None] + right[1] * CROSS_M[None, :]
+    surface = ErrorSurface(
+        north_m=CROSS_M,
+        east_m=CROSS_M,
+        overlap_cells=np.full(off_m.shape, 500.0),
+        residual_m2=0.01 * (0.5 + off_m**2 / 4.0),
+        noise_m2=np.full(off_m.shape, 0.01),
+        depth_offset_m=np.zeros(off_m.shape),
+    )
+    found = ridge_of(surface, 1.0, Prior(np.zeros(2), 100.0 * np.eye(2)), np.zeros(2), about)
+    assert np.degrees(np.arccos(found.axis @ right)) < 1.0
+    assert np.degrees(found.sigma_rad) < 3.0

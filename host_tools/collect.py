@@ -143,7 +143,7 @@ def result_of_record(
         truth_map=truth_map,
         counters=counters,
         quantities=record.quantities,
-        remarks=record.remarks,
+        remarks=[*site.raster.remarks, *record.remarks],
         settings={key: value for key, value, *_ in flatten(settings)},
     )
 

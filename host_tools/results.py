@@ -85,7 +85,8 @@ class MissionResult:
 
     truth_map was fed, sounding by sounding, by the simulated vehicles. patches is read once.
     counters are grouped by their owner (leader, follower_1, water ...). quantities and
-    remarks are what the estimator knows of the vehicles together, in numbers and in words.
+    remarks are what the estimator knows of the vehicles together, in numbers and in words; remarks
+    on the terrain come first.
     """
 
     scenario: ScenarioSettings

@@ -9,15 +9,19 @@ from affine import Affine
 from numpy.typing import NDArray
 from rasterio.crs import CRS
 from rasterio.errors import RasterioError
+from rasterio.io import DatasetReader
 from rasterio.windows import Window
 
 from protocol.errors import ConfigError
+from protocol.packets import DEEPEST_M, HIGHEST_M
 
 BUILT_IN = "built-in relief"
 BUILT_IN_EPSG = 32631
 BUILT_IN_CELL_M = 5.0
 BUILT_IN_CELLS = 600
 COARSE_CELLS = 4_000_000
+FILLS = (-9999, 9999, -32768, -32767, 32767, -99999, 99999, -999999)
+"""Stored where nothing was measured: believed of files that declare no such value themselves."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,7 +29,8 @@ class Raster:
     """A north-up grid of elevations in a projected system in metres; row 0 is the northernmost.
 
     `read` may be asked for any window; `coarse_m` (R, C) is the whole grid thinned for planning,
-    NaN where there is no data, and `coarse_step` says by how many cells.
+    NaN where there is no data, and `coarse_step` says by how many cells. remarks say what was
+    taken for no data though the file does not call it so.
     """
 
     name: str
@@ -38,6 +43,7 @@ class Raster:
     coarse_step: int
     positive_down: bool
     relief_m: NDArray[np.float32] | None = None
+    remarks: tuple[str, ...] = ()
 
     @property
     def cell_east_m(self) -> float:
@@ -59,7 +65,8 @@ class Raster:
             ]
         with rasterio.open(self.path) as dataset:
             window = Window(first_column, first_row, columns, rows)
-            return _clean(dataset.read(1, window=window, masked=True), self.positive_down)
+            values = _values(dataset, dataset.read(1, window=window, masked=True))
+            return _elevations(values, self.positive_down)
 
 
 def open_terrain(path: Path | None, relief_seed: int = 1) -> Raster:
@@ -81,12 +88,14 @@ def open_terrain(path: Path | None, relief_seed: int = 1) -> Raster:
             _check_reference(path, dataset.crs, dataset.transform, dataset.count)
             step = max(1, int(np.ceil(np.sqrt(dataset.width * dataset.height / COARSE_CELLS))))
             shape = (max(1, dataset.height // step), max(1, dataset.width // step))
-            thinned = dataset.read(1, masked=True, out_shape=shape)
-            elevation_m = _clean(thinned, positive_down=False)
+            stored = dataset.read(1, masked=True, out_shape=shape)
+            values = _values(dataset, stored)
+            believable = np.abs(values) <= DEEPEST_M
+            positive_down = bool(believable.any() and np.median(values[believable]) > 0.0)
+            elevation_m = _elevations(values, positive_down)
             known = np.isfinite(elevation_m)
             if not known.any():
                 raise ConfigError(f"terrain {path} holds no data: every cell is no-data")
-            positive_down = bool(np.median(elevation_m[known]) > 0.0)
             return Raster(
                 name=path.name,
                 path=path,
@@ -94,9 +103,10 @@ def open_terrain(path: Path | None, relief_seed: int = 1) -> Raster:
                 transform=dataset.transform,
                 rows=dataset.height,
                 columns=dataset.width,
-                coarse_m=-elevation_m if positive_down else elevation_m,
+                coarse_m=elevation_m,
                 coarse_step=step,
                 positive_down=positive_down,
+                remarks=_remarks(path.name, stored, known),
             )
     except RasterioError as error:
         raise ConfigError(f"terrain {path} cannot be read as a raster: {error}") from error
@@ -116,12 +126,32 @@ def _check_reference(path: Path, crs: CRS | None, transform: Affine, bands: int)
         raise ConfigError(f"terrain {path} is not a north-up grid; rotate it with gdalwarp")
 
 
-def _clean(grid: NDArray[np.generic], positive_down: bool) -> NDArray[np.float32]:
-    elevation_m = np.ma.filled(np.ma.asarray(grid).astype(np.float32), np.nan)
-    # Nothing on Earth is farther from the sea's surface: undeclared no-data values.
-    elevation_m[~(np.abs(elevation_m) < 12_000.0)] = np.nan
-    cleaned: NDArray[np.float32] = -elevation_m if positive_down else elevation_m
-    return cleaned
+def _values(dataset: DatasetReader, stored: np.ma.MaskedArray) -> NDArray[np.float64]:
+    """Return metres, scaled as the band says, NaN where it holds no data or a usual fill."""
+    values: NDArray[np.float64] = np.ma.filled(stored.astype(np.float64), np.nan)
+    if dataset.nodata is None:
+        values[np.isin(values, FILLS)] = np.nan
+    return values * float(dataset.scales[0]) + float(dataset.offsets[0])
+
+
+def _elevations(values: NDArray[np.float64], positive_down: bool) -> NDArray[np.float32]:
+    """Return elevations, up positive; NaN where no seabed can be: `DEEPEST_M`, `HIGHEST_M`."""
+    elevation_m = (-values if positive_down else values).astype(np.float32)
+    elevation_m[~((elevation_m >= -DEEPEST_M) & (elevation_m <= -HIGHEST_M))] = np.nan
+    return elevation_m
+
+
+def _remarks(name: str, stored: np.ma.MaskedArray, known: NDArray[np.bool_]) -> tuple[str, ...]:
+    """Return one remark on cells that were taken for no data untold, if there are any."""
+    untold = np.ma.filled(np.isfinite(stored), False) & ~known
+    if not untold.any():
+        return ()
+    low, high = stored.data[untold].min(), stored.data[untold].max()
+    held = f"{low:g}" if low == high else f"{low:g} to {high:g}"
+    return (
+        f"terrain {name}: {untold.mean():.1%} of its cells hold values ({held}) that no seabed "
+        "has, and are taken as unknown; declare them as no-data (gdal_edit.py -a_nodata)",
+    )
 
 
 def _built_in(seed: int) -> Raster:

@@ -18,7 +18,12 @@ PAPER = named_scenario("paper-1")
 
 
 def write_raster(
-    path: Path, elevation_m: np.ndarray, cell_m: float = 5.0, crs: str | None = "EPSG:32619"
+    path: Path,
+    elevation_m: np.ndarray,
+    cell_m: float = 5.0,
+    crs: str | None = "EPSG:32619",
+    nodata: float | None = -9999.0,
+    dtype: str = "float32",
 ) -> Path:
     with rasterio.open(
         path,
@@ -27,12 +32,12 @@ def write_raster(
         height=elevation_m.shape[0],
         width=elevation_m.shape[1],
         count=1,
-        dtype="float32",
+        dtype=dtype,
         crs=crs,
         transform=Affine(cell_m, 0.0, 350_000.0, 0.0, -cell_m, 4_680_000.0),
-        nodata=-9999.0,
+        nodata=nodata,
     ) as dataset:
-        dataset.write(elevation_m.astype("float32"), 1)
+        dataset.write(elevation_m.astype(dtype), 1)
     return path
 
 
@@ -90,6 +95,53 @@ def test_depths_stored_positive_down_are_turned_over(tmp_path: Path) -> None:
     up = place_survey(open_terrain(write_raster(tmp_path / "u.tif", slope())), PAPER, 1)
     down = place_survey(open_terrain(write_raster(tmp_path / "d.tif", -slope())), PAPER, 1)
     np.testing.assert_array_equal(up.seabed.depth_m, down.seabed.depth_m)
+
+
+@pytest.mark.parametrize("up", [1.0, -1.0])
+def test_scale_and_offset_of_the_band_make_metres(tmp_path: Path, up: float) -> None:
+    whole = np.round(slope())
+    metres = open_terrain(write_raster(tmp_path / "m.tif", up * whole))
+    path = write_raster(
+        tmp_path / "cm.tif", up * (100.0 * whole - 700.0), nodata=-32768, dtype="int16"
+    )
+    with rasterio.open(path, "r+") as dataset:
+        dataset.scales, dataset.offsets = (0.01,), (up * 7.0,)
+    scaled = open_terrain(path)
+    np.testing.assert_allclose(scaled.coarse_m, metres.coarse_m, atol=1e-4)
+    np.testing.assert_allclose(scaled.read(10, 20, 30, 40), metres.read(10, 20, 30, 40), atol=1e-4)
+    assert scaled.remarks == ()
+
+
+@pytest.mark.parametrize("up", [1.0, -1.0])
+@pytest.mark.parametrize("fill", [-9999.0, 9999.0, -32768.0, -32767.0, -99999.0, 1e20, "land"])
+def test_a_fill_that_is_not_declared_is_no_seabed_and_is_told(
+    tmp_path: Path, fill: float | str, up: float
+) -> None:
+    elevation_m = slope()
+    elevation_m[40:60] = np.nan
+    stored = up * elevation_m
+    stored[150:200, 100:] = fill = up * 250.0 if isinstance(fill, str) else fill
+    terrain = open_terrain(write_raster(tmp_path / "a.tif", stored, nodata=None))
+    elevation_m[150:200, 100:] = np.nan
+    np.testing.assert_array_equal(terrain.coarse_m, elevation_m.astype(np.float32))
+    np.testing.assert_array_equal(terrain.read(0, 0, 300, 300), elevation_m.astype(np.float32))
+    (remark,) = terrain.remarks
+    assert f"a.tif: 11.1% of its cells hold values ({fill:g}" in remark
+
+
+def test_a_fill_stored_in_other_units_is_no_seabed_either(tmp_path: Path) -> None:
+    stored = 100.0 * slope()
+    stored[150:200] = -32768
+    path = write_raster(tmp_path / "cm.tif", stored, nodata=None, dtype="int16")
+    with rasterio.open(path, "r+") as dataset:
+        dataset.scales = (0.01,)
+    assert np.isnan(open_terrain(path).read(150, 0, 50, 300)).all()
+
+
+def test_declared_no_data_is_no_remark(tmp_path: Path) -> None:
+    elevation_m = slope()
+    elevation_m[150:200] = -9999.0
+    assert open_terrain(write_raster(tmp_path / "a.tif", elevation_m)).remarks == ()
 
 
 def test_not_a_raster_is_a_clear_error(tmp_path: Path) -> None:

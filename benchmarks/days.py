@@ -176,7 +176,7 @@ def mission(
             remotes,
             water_between(settings, vehicles, seed),
             duration_s=scenario.duration_s,
-            tick_s=1.0 / scenario.ping_hz,
+            tick_s=scenario.tick_s,
             record=lambda _: None,
             progress=watch,
         )

@@ -48,7 +48,7 @@ def mortal_mission(
 ) -> Outcome:
     """Return a mission with a number of kills shared among its vehicles."""
     vehicles = simulated_vehicles(settings, site, seed)
-    tick_s = 1.0 / settings.scenario.ping_hz
+    tick_s = settings.scenario.tick_s
     events = 5.0 * settings.scenario.duration_s * settings.scenario.ping_hz
     share = [len(part) for part in np.array_split(np.arange(kills), len(vehicles))]
     fates = [

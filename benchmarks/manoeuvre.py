@@ -57,7 +57,7 @@ def sail(
         {0: leader, **{node.core.vehicle: node for node in followers}},
         water_between(settings, vehicles, seed),
         duration_s=scenario.duration_s,
-        tick_s=1.0 / scenario.ping_hz,
+        tick_s=scenario.tick_s,
         record=lambda _: None,
         progress=watch,
     )

@@ -10,6 +10,7 @@ from protocol.errors import ConfigError
 from protocol.settings import Settings, flatten, replace, setting
 
 KNOT_MPS = 1852.0 / 3600.0
+MOST_TICKS_HZ = 40
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,7 +71,9 @@ class ScenarioSettings(Settings):
 
     beams: int = setting(192, "", "beams of the sonar (paper, 6.1)", minimum=2, maximum=2048)
     swath_deg: float = setting(120.0, "deg", "opening angle", minimum=10.0, maximum=150.0)
-    ping_hz: float = setting(4.0, "Hz", "pings and navigation a second", minimum=0.5, maximum=20.0)
+    ping_hz: float = setting(
+        4.0, "Hz", "pings a second; navigation comes with each", minimum=0.5, maximum=20.0
+    )
     sounding_sigma_m: float = setting(0.15, "m", "noise of a slant range", minimum=0.0, maximum=5.0)
     sounding_sigma_share: float = setting(
         0.003, "", "the same as a share of the range, in quadrature", minimum=0.0, maximum=0.2
@@ -130,6 +133,23 @@ class ScenarioSettings(Settings):
     def duration_s(self) -> float:
         """How long the mission lasts, in seconds."""
         return 60.0 * self.duration_min
+
+    @property
+    def tick_hz(self) -> int:
+        """The rate of the mission's clock and of navigation, a whole number.
+
+        Frames leave and outputs stand on whole seconds, which must be ticks for that. It is the
+        least rate at which each ping falls on a tick, too; where none up to `MOST_TICKS_HZ` has
+        that, it is this one, and pings wait for the next tick.
+        """
+        rates = range(math.ceil(self.ping_hz), MOST_TICKS_HZ)
+        exact = (hz for hz in rates if math.isclose(hz / self.ping_hz, round(hz / self.ping_hz)))
+        return next(exact, MOST_TICKS_HZ)
+
+    @property
+    def tick_s(self) -> float:
+        """The time between two ticks."""
+        return 1.0 / self.tick_hz
 
     def survey_s(self, vehicle: int) -> float:
         """Return for how long vehicle (0: leader) surveys, in seconds."""

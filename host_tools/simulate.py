@@ -41,7 +41,7 @@ def simulate(
         {0: leader, **{node.core.vehicle: node for node in followers}},
         water_between(settings, vehicles, seed),
         duration_s=scenario.duration_s,
-        tick_s=1.0 / scenario.ping_hz,
+        tick_s=scenario.tick_s,
         record=deliveries.append,
         progress=progress,
     )

@@ -30,7 +30,7 @@ class Voyage:
     @property
     def tick_s(self) -> float:
         """The period of all loops."""
-        return 1.0 / self.settings.scenario.ping_hz
+        return self.settings.scenario.tick_s
 
     @property
     def fingerprint(self) -> str:

@@ -1,10 +1,12 @@
 """A surveying vehicle: what its sensors say, and, for the evaluation only, where it truly is."""
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from firmware.geometry import Array, wrap_angle
 from firmware.soundings import Fix, Odometry, Ping
@@ -32,9 +34,10 @@ class TrueTrack:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Chunk:
-    """Measurements of consecutive pings; arrays are (P,), ranges_m is (P, B)."""
+    """Measurements of consecutive ticks; arrays are (P,), ranges_m is (P, B), NaN without ping."""
 
     time_s: Array
+    is_ping: NDArray[np.bool_]
     velocity_mps: Array  # (P, 2)
     roll_rad: Array
     pitch_rad: Array
@@ -96,11 +99,11 @@ class SimulatedVehicle:
         )
 
     def steps(self) -> Iterator[tuple[Odometry, Ping | None]]:
-        """Yield navigation and ping in time order, at ping rate, from 0 to the mission's end.
+        """Yield navigation and, where there is one, ping of each tick from 0 to the mission's end.
 
         An odometry's velocity is the mean over the interval that ends at its time, so that their
         sum is the dead-reckoned track without an error of integration. After the survey the sonar
-        is off and the ping None.
+        is off.
         """
         beams_rad = self._sonar.angles_rad
         for chunk in self._chunks():
@@ -115,7 +118,8 @@ class SimulatedVehicle:
                     depth_m=depth_m,
                     fix=self._fix(time_s),
                 )
-                if chunk.ranges_m is None or time_s > self._survey_s:
+                is_silent = time_s > self._survey_s or not chunk.is_ping[k]
+                if chunk.ranges_m is None or is_silent:
                     yield odometry, None
                     continue
                 yield (
@@ -157,38 +161,45 @@ class SimulatedVehicle:
         )
 
     def _chunks(self) -> Iterator[_Chunk]:
-        rate_hz = self._scenario.ping_hz
+        rate_hz = self._scenario.tick_hz
         last = math.floor(self._scenario.duration_s * rate_hz + 1e-9)
         size = max(1, round(CHUNK_S * rate_hz))
         for first in range(0, last + 1, size):
-            yield self._chunk(np.arange(first, min(first + size, last + 1)) / rate_hz)
+            yield self._chunk(np.arange(first, min(first + size, last + 1)))
 
-    def _chunk(self, time_s: Array) -> _Chunk:
+    def _chunk(self, ticks: NDArray[np.int64]) -> _Chunk:
+        rate_hz = self._scenario.tick_hz
+        time_s = ticks / rate_hz
+        pings_due = np.floor(np.stack([ticks - 1, ticks]) * self._scenario.ping_hz / rate_hz + 1e-9)
         poses = self._poses(time_s)
-        before_s = np.concatenate([[max(0.0, time_s[0] - 1.0 / self._scenario.ping_hz)], time_s])
+        before_s = np.concatenate([[max(0.0, time_s[0] - self._scenario.tick_s)], time_s])
         path = self._path.at(before_s)
         reckoned_m = self._errors.reckoned_steps(
             before_s, np.stack([path.north_m, path.east_m], axis=1)
         )
-        pings = len(time_s)
         tilt_rad = math.radians(self._scenario.attitude_noise_deg)
-        noise = self._attitude_rng.standard_normal((3, pings))
+        noise = self._attitude_rng.standard_normal((3, len(time_s)))
         heading_rad = math.radians(self._scenario.heading_noise_deg) * noise[2]
         chunk = _Chunk(
             time_s=time_s,
-            velocity_mps=reckoned_m * self._scenario.ping_hz,
+            is_ping=pings_due[1] > pings_due[0],
+            velocity_mps=reckoned_m * rate_hz,
             roll_rad=poses.roll_rad + tilt_rad * noise[0],
             pitch_rad=poses.pitch_rad + tilt_rad * noise[1],
             yaw_rad=wrap_angle(poses.yaw_rad + self._errors.heading_bias_rad + heading_rad),
             depth_m=poses.depth_m + self._errors.depth_offset_m(time_s),
             ranges_m=None,
         )
-        if time_s[0] > self._survey_s:
+        if time_s[0] > self._survey_s or not chunk.is_ping.any():
             return chunk
         return self._with_ranges(chunk, poses)
 
     def _with_ranges(self, chunk: _Chunk, poses: Poses) -> _Chunk:
-        ranges_m, fliers = self._sonar.measure(poses)
+        at = chunk.is_ping
+        pinged = Poses(**{name: getattr(poses, name)[at] for name in Poses.__slots__})
+        ranges_m = np.full((len(at), len(self._sonar.angles_rad)), np.nan)
+        fliers = np.zeros(ranges_m.shape, dtype=np.bool_)
+        ranges_m[at], fliers[at] = self._sonar.measure(pinged)
         if self._on_soundings is not None:
             used = ~fliers & (chunk.time_s <= self._survey_s)[:, None]
             measured = Poses(
@@ -200,15 +211,7 @@ class SimulatedVehicle:
                 yaw_rad=chunk.yaw_rad,
             )
             self._on_soundings(self._sonar.soundings(measured, np.where(used, ranges_m, np.nan)))
-        return _Chunk(
-            time_s=chunk.time_s,
-            velocity_mps=chunk.velocity_mps,
-            roll_rad=chunk.roll_rad,
-            pitch_rad=chunk.pitch_rad,
-            yaw_rad=chunk.yaw_rad,
-            depth_m=chunk.depth_m,
-            ranges_m=ranges_m,
-        )
+        return dataclasses.replace(chunk, ranges_m=ranges_m)
 
     def _poses(self, time_s: Array) -> Poses:
         path = self._path.at(time_s)

@@ -33,6 +33,19 @@ def test_same_seed_writes_the_same_air_byte_for_byte(
         assert np.isfinite(rows).all()
 
 
+@pytest.mark.parametrize("ping_hz", ["0.5", "2.5"])
+def test_pings_at_any_rate_leave_answers_and_outputs_on_whole_seconds(
+    tmp_path: Path, ping_hz: str
+) -> None:
+    assert simulate(tmp_path, "--no-report", "--set", f"ping_hz={ping_hz}") == 0
+    for name in ("leader_truth", "leader_live", "follower_1_dead_reckoning", "follower_1_final"):
+        rows = np.loadtxt(tmp_path / f"{name}.tum")
+        np.testing.assert_array_equal(rows[:, 0], np.arange(151.0))
+    air = [json.loads(line) for line in (tmp_path / "air.jsonl").read_text().splitlines()]
+    assert all(line["t_tx_s"] % 1.0 == 0.0 for line in air)
+    assert {line["source"] for line in air} == {0, 1}
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

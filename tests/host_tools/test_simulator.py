@@ -104,6 +104,27 @@ def test_noise_free_odometry_sums_to_the_true_track_through_turns() -> None:
         assert np.hypot(*(position_m - truth)) < 1e-6
 
 
+@pytest.mark.parametrize(
+    ("ping_hz", "tick_hz"), [(4, 4), (0.5, 1), (1.5, 3), (2.5, 5), (3.7, 37), (19.3, 40), (20, 20)]
+)
+def test_pings_come_at_their_rate_and_navigation_on_whole_seconds_too(
+    ping_hz: float, tick_hz: int
+) -> None:
+    scenario = replace(
+        named_scenario("paper-1"), {"duration_min": 0.9, "beams": 2, "ping_hz": ping_hz}
+    )
+    seabed = Seabed(np.full((8, 8), 50.0), -2000.0, -2000.0, 700.0, 700.0)
+    steps = list(SimulatedVehicle(scenario, seabed, 0, 1).steps())
+    assert scenario.tick_hz == tick_hz
+    assert {float(t) for t in range(55)} <= {odometry.time_s for odometry, _ in steps}
+    pings_s = np.array([ping.time_s for _, ping in steps if ping is not None])
+    due_s = np.arange(len(pings_s)) / ping_hz
+    assert len(pings_s) == int(54 * ping_hz) + 1
+    assert np.all((pings_s > due_s - 1e-6) & (pings_s < due_s + scenario.tick_s))
+    if tick_hz < 40:
+        np.testing.assert_allclose(pings_s, due_s, atol=1e-6)
+
+
 def test_eq_12_has_the_stated_mean_and_variance_once_a_second() -> None:
     scenario = replace(
         named_scenario("paper-1"), {"duration_min": 60, "follower_duration_min": 0.5, "beams": 2}

@@ -16,7 +16,15 @@ from firmware.submaps import Track
 from host_tools.commands import CHOICES, Command
 from protocol.codec import decode, encode
 from protocol.errors import ConfigError, EstimationError, ProtocolError, RemoteProtocolError
-from protocol.packets import FARTHEST_M, SIZE_BYTES, Profile, SubmapFragment, SubmapPacket
+from protocol.packets import (
+    DEEPEST_M,
+    FARTHEST_M,
+    HIGHEST_M,
+    SIZE_BYTES,
+    Profile,
+    SubmapFragment,
+    SubmapPacket,
+)
 from protocol.settings import replace
 
 _SOUNDINGS = ("north_m", "east_m", "depth_m", "time_s")
@@ -127,6 +135,12 @@ def read_soundings(path: Path) -> tuple[list[Array], Track]:
         raise ConfigError(
             f"{path}: coordinates of {farthest_m:.0f} m; give them from a mission datum within "
             f"{FARTHEST_M / 1000:.0f} km, float32 on the wire steps by half a metre out there"
+        )
+    depth_m = float(np.nanmedian(columns[2]))
+    if not HIGHEST_M <= depth_m <= DEEPEST_M:
+        raise ConfigError(
+            f"{path}: depths of {depth_m:.0f} m; give metres, positive down, from {HIGHEST_M:.0f} "
+            f"to {DEEPEST_M:.0f}"
         )
     given = [name for name in _TRACK if name in arrays]
     if given and len(given) < len(_TRACK):

@@ -32,6 +32,7 @@ _PROBES = 8  # that tell how much the cells say of each coefficient
 _PROBE_SIGMA = 4.0  # coefficients over which that is the same
 _SHY = 1.03  # on the information: a spectrum too low costs less than one too high
 _SMALLEST_M2 = 1e-9
+_LARGEST_TERMS = np.array([2.0**19 - 1.0, 127.0, 127.0, 127.0, 127.0, 127.0])  # that the wire holds
 
 Float32 = NDArray[np.float32]
 
@@ -73,16 +74,17 @@ class Trend:
 
 
 def fitted_trend(bins: BinnedSoundings, frame: LatticeFrame) -> Trend:
-    """Return the trend nearest to the cells; steps grow until all terms but the first fit 8 bits.
+    """Return the trend nearest to the cells, in the least steps in which its terms fit the wire.
 
-    What a quadratic takes away, the cosines need not bend at the frame's edges for.
+    Steps of a centimetre reach down to 5,243 m, steps of two to 10,486 m. What a quadratic takes
+    away, the cosines need not bend at the frame's edges for.
     """
     nodes = frame.nodes_of(np.column_stack([bins.north_m, bins.east_m]))
     design = _quadratic(nodes, frame)
     ridge = 1e-3 * len(nodes) * np.diag([0.0, 1.0, 1.0, 1.0, 1.0, 1.0])
     exact = np.linalg.solve(design.T @ design + ridge + 1e-9 * np.eye(6), design.T @ bins.depth_m)
     scale = 0
-    while np.abs(exact[1:]).max() > 0.01 * 2.0**scale * 127.0:
+    while np.any(np.abs(exact) > 0.01 * 2.0**scale * _LARGEST_TERMS):
         scale += 1
     steps = np.round(exact / (0.01 * 2.0**scale)).astype(int)
     return Trend(terms=tuple(int(step) for step in steps), scale=scale)

@@ -212,8 +212,7 @@ def _residual_m2(field: Field, bins: BinnedSoundings) -> float:
 
 def _geometry(field: Field, variances_m2: list[float]) -> bytes:
     frame, terms = field.frame, field.trend.terms
-    mean = int(np.clip(terms[0] >> 4, -32768, 32767))
-    low = terms[0] & 15
+    mean, low = terms[0] >> 4, terms[0] & 15
     return _GEOMETRY.pack(
         frame.corner_north_q,
         frame.corner_east_q,

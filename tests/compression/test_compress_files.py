@@ -62,6 +62,19 @@ def test_small_frames_of_62_bytes_hold_a_lattice(survey: Survey, tmp_path: Path)
     assert (tmp_path / "frames.bin").stat().st_size == 620
 
 
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("deeper_m", [-130.0, 6000.0, 10_900.0, 11_900.0])
+def test_depth_of_the_sea_does_not_matter(
+    deeper_m: float, profile: str, survey: Survey, tmp_path: Path
+) -> None:
+    deep = survey.soundings_ned_m + np.array([0.0, 0.0, deeper_m])
+    soundings = saved(tmp_path / "s.npz", deep, survey.time_s)
+    north_m, east_m, depth_m, _ = grid_of(tmp_path, soundings, profile, set())
+    error_m = depth_m - deeper_m - relief_m(*np.meshgrid(north_m, east_m, indexing="ij"))
+    assert np.sqrt(np.nanmean(error_m**2)) < 0.3  # m
+    assert np.isfinite(depth_m).mean() > 0.7
+
+
 # hardly any depth is then as certain as the 0.1 m2 that the leader keeps
 UNCERTAIN = {"fewer soundings than points", "millimetres across", "cliff of 40 m"}
 
@@ -126,6 +139,8 @@ def test_one_line_of_soundings_is_told_from_a_map(profile: str, tmp_path: Path) 
         (np.array([[4_600_000.0, 330_000.0, 20.0]] * 9), "mission datum"),
         (np.full((9, 3), np.nan), "no sounding that is finite"),
         (np.array([[1.0, 2.0, 20.0]] * 9), "usable cells"),
+        (np.array([[1.0, 2.0, 12_500.0]] * 9), r"depths of 12500 m; .* to 12000"),
+        (np.array([[1.0, 2.0, -6_000.0]] * 9), "positive down"),
     ],
 )
 def test_soundings_of_which_no_map_can_be_made_are_refused(

@@ -1,6 +1,7 @@
 """`fathomlink compress` and `fathomlink reconstruct`: soundings to frames to a grid, by files."""
 
 import argparse
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from firmware.submaps import Track
 from host_tools.commands import CHOICES, Command
 from protocol.codec import decode, encode
 from protocol.errors import ConfigError, EstimationError, ProtocolError, RemoteProtocolError
+from protocol.lattice import PROTECTION_BYTES
 from protocol.packets import (
     DEEPEST_M,
     FARTHEST_M,
@@ -90,6 +92,12 @@ def reconstruct_file(frames: Path, out: Path, drop: set[int], cell_m: float) -> 
     except EstimationError as error:
         raise ConfigError(f"{len(kept)} frames of {frames} give no map: {error}") from error
     grid = found.grid
+    good = int(np.count_nonzero(np.isfinite(grid.depth_m)))
+    if not good:
+        raise ConfigError(
+            f"{len(kept)} of {len(fragments)} frames of {frames} give no cell: "
+            + _why_no_cell(kept, settings)
+        )
     with open(out, "wb") as file:
         rows, columns = grid.depth_m.shape
         np.savez_compressed(
@@ -99,10 +107,27 @@ def reconstruct_file(frames: Path, out: Path, drop: set[int], cell_m: float) -> 
             depth_m=grid.depth_m,
             variance_m2=grid.variance_m2,
         )
-    good = int(np.count_nonzero(np.isfinite(grid.depth_m)))
     return (
         f"{len(kept)} of {len(fragments)} frames, {good} cells of {grid.cell_m:g} m; "
         f"{found.recovered_points} points recovered from parity"
+    )
+
+
+def _why_no_cell(
+    fragments: dict[int, SubmapPacket | SubmapFragment], settings: ReconstructionSettings
+) -> str:
+    """Return why a rebuilt grid is empty, and what would fill it."""
+    most_m2 = settings.max_variance_m2
+    uncut = replace(settings, {"max_variance_m2": np.inf})
+    variance_m2 = reconstruct_packets(fragments, uncut, 0.0).grid.variance_m2
+    if not np.isfinite(variance_m2).any():
+        return (
+            f"the soundings enclose none of {settings.cell_m:g} m; compress those of a swath, or "
+            "give a smaller --cell"
+        )
+    return (
+        f"no depth has a variance up to {most_m2:g} m2, the least is {np.nanmin(variance_m2):.2g}; "
+        "drop fewer frames, or compress more soundings, less rough ones, or as another --profile"
     )
 
 
@@ -169,6 +194,7 @@ def read_frames(path: Path) -> dict[int, SubmapPacket | SubmapFragment]:
     if len(data) % size:
         raise ConfigError(f"{path} has {len(data)} bytes; frames have 256, small ones 62")
     fragments: dict[int, SubmapPacket | SubmapFragment] = {}
+    first = None
     for start in range(0, len(data), size):
         try:
             packet = decode(data[start : start + size])
@@ -176,8 +202,34 @@ def read_frames(path: Path) -> dict[int, SubmapPacket | SubmapFragment]:
             raise ConfigError(f"{path}, frame {start // size}: {error}") from error
         if not isinstance(packet, SubmapPacket | SubmapFragment):
             raise ConfigError(f"{path}, frame {start // size} is no fragment of a sub-map")
-        fragments[packet.header.fragment] = packet
+        first = packet if first is None else first
+        known = fragments.setdefault(packet.header.fragment, packet)
+        if _common(packet) != _common(first) or _content(packet) != _content(known):
+            raise ConfigError(
+                f"{path}, frame {start // size} ({_named(packet)}) is of another sub-map than "
+                f"frame 0 ({_named(first)}); give the frames of one"
+            )
     return fragments
+
+
+def _common(packet: SubmapPacket | SubmapFragment) -> tuple[object, ...]:
+    """Return what all fragments of a sub-map have in common."""
+    header = packet.header
+    key = (header.profile, header.vehicle, header.boot_epoch, header.submap, header.fragment_count)
+    if isinstance(packet, SubmapPacket):
+        return (*key, packet.hyperparameters.tobytes())
+    return (*key, packet.body[:PROTECTION_BYTES])
+
+
+def _content(packet: SubmapPacket | SubmapFragment) -> bytes:
+    """Return what a repeat of a fragment has in common with it: all but when it was sent."""
+    header = dataclasses.replace(packet.header, tx_second=0)
+    return encode(dataclasses.replace(packet, header=header))
+
+
+def _named(packet: SubmapPacket | SubmapFragment) -> str:
+    header = packet.header
+    return f"{header.profile.name}, vehicle {header.vehicle}, number {header.submap}"
 
 
 def _given_track(path: Path, arrays: dict[str, Array]) -> Track:

@@ -1,5 +1,7 @@
 """The file commands, on good soundings and on every bad input that was thought of."""
 
+import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 from firmware.compression.settings import CompressionSettings
 from firmware.geometry import Array
 from host_tools.compress_files import compress_file, reconstruct_file
+from protocol.codec import decode, encode
 from protocol.errors import ConfigError
 from tests.compression.conftest import Survey, relief_m
 
@@ -77,6 +80,7 @@ def test_depth_of_the_sea_does_not_matter(
 
 # hardly any depth is then as certain as the 0.1 m2 that the leader keeps
 UNCERTAIN = {"fewer soundings than points", "millimetres across", "cliff of 40 m"}
+NO_CELL = "give no cell: (no depth has a variance up to .* m2, the least is|the soundings enclose)"
 
 
 def bad_inputs() -> dict[str, Array]:
@@ -114,10 +118,56 @@ def test_awkward_soundings_give_frames_and_a_grid_or_one_clear_error(
         with pytest.raises(ConfigError, match="track"):
             grid_of(tmp_path, soundings, profile, set())
         return
-    _, _, depth_m, _ = grid_of(tmp_path, soundings, profile, set())
+    depth_m, refusal = np.full(1, np.nan), "none"
+    try:
+        _, _, depth_m, _ = grid_of(tmp_path, soundings, profile, set())
+    except ConfigError as error:
+        refusal = str(error)
     finite = depth_m[np.isfinite(depth_m)]
+    assert finite.size or re.search(NO_CELL, refusal)
     assert (finite.size > 0.01 * depth_m.size) != (name in UNCERTAIN)
     assert np.all((finite > 0.0) & (finite < 90.0))
+
+
+@pytest.mark.parametrize(
+    ("second", "vehicle"), [("lattice", 2), ("lattice", 1), ("dense", 1), ("paper", 1)]
+)
+def test_frames_of_two_sub_maps_are_refused(
+    second: str, vehicle: int, survey: Survey, tmp_path: Path
+) -> None:
+    soundings = saved(tmp_path / "s.npz", survey.soundings_ned_m, survey.time_s)
+    other = saved(tmp_path / "o.npz", survey.soundings_ned_m[::2], survey.time_s[::2])
+    one, two, both = (tmp_path / name for name in ("1.bin", "2.bin", "both.bin"))
+    compress_file(soundings, one, "lattice", settings=QUICK)
+    compress_file(other, two, second, settings=QUICK)
+    frames = [renumbered(data, vehicle) for data in frames_of(two)]
+    both.write_bytes(one.read_bytes() + b"".join(frames))
+    with pytest.raises(ConfigError, match=r"frame 10 \(.*\) is of another sub-map than frame 0"):
+        reconstruct_file(both, tmp_path / "g.npz", set(), 1.0)
+    both.write_bytes(b"".join(frames_of(one)[:5] + frames[5:]))
+    with pytest.raises(ConfigError, match=r"frame 5 \(.*\) is of another sub-map than frame 0"):
+        reconstruct_file(both, tmp_path / "g.npz", set(), 1.0)
+
+
+def test_repeats_of_frames_are_frames_of_the_sub_map(survey: Survey, tmp_path: Path) -> None:
+    soundings = saved(tmp_path / "s.npz", survey.soundings_ned_m, survey.time_s)
+    frames = tmp_path / "f.bin"
+    compress_file(soundings, frames, "lattice", settings=QUICK)
+    again = b"".join(renumbered(data, 1, tx_second=9) for data in frames_of(frames)[:4])
+    frames.write_bytes(frames.read_bytes() + again)
+    line = reconstruct_file(frames, tmp_path / "g.npz", set(), 1.0)
+    assert line.startswith("10 of 10 frames")
+
+
+def frames_of(path: Path) -> list[bytes]:
+    data = path.read_bytes()
+    return [data[start : start + 256] for start in range(0, len(data), 256)]
+
+
+def renumbered(data: bytes, vehicle: int, tx_second: int = 0) -> bytes:
+    packet = decode(data)
+    header = dataclasses.replace(packet.header, vehicle=vehicle, tx_second=tx_second)
+    return encode(dataclasses.replace(packet, header=header))
 
 
 @pytest.mark.parametrize("profile", PROFILES)
@@ -125,12 +175,8 @@ def test_one_line_of_soundings_is_told_from_a_map(profile: str, tmp_path: Path) 
     along = np.linspace(-40.0, 40.0, 3000)
     line = np.column_stack([along, np.zeros(3000), relief_m(along, np.zeros(3000))])
     soundings = saved(tmp_path / "s.npz", line)
-    if profile != "lattice":
-        with pytest.raises(ConfigError, match="line"):
-            grid_of(tmp_path, soundings, profile, set())
-        return
-    _, _, depth_m, _ = grid_of(tmp_path, soundings, profile, set())
-    assert np.isfinite(depth_m).sum() < 1000  # no more than the blocks along it
+    with pytest.raises(ConfigError, match="enclose none" if profile == "lattice" else "line"):
+        grid_of(tmp_path, soundings, profile, set())
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +64,8 @@ def compress_file(
         data = b"".join(encode(packet) for packet in packets)
     except (EstimationError, ProtocolError) as error:
         raise ConfigError(f"{soundings} makes no {profile} sub-map: {error}") from error
+    if small:
+        _check_map(soundings, packets)
     _write(out, data)
     report = compressed.report
     return (
@@ -113,6 +116,17 @@ def reconstruct_file(frames: Path, out: Path, drop: set[int], cell_m: float) -> 
     )
 
 
+def _check_map(soundings: Path, packets: Sequence[SubmapPacket | SubmapFragment]) -> None:
+    """Raise ConfigError where small frames hold so much track that no map comes of all of them."""
+    try:
+        reconstruct_packets(dict(enumerate(packets)), ReconstructionSettings(), 0.0)
+    except EstimationError as error:
+        raise ConfigError(
+            f"{soundings} makes no map in {len(packets)} frames of 62 bytes, filled by its track; "
+            f"give a smooth one ({', '.join(_TRACK)}) or more --frames, or leave --small out"
+        ) from error
+
+
 def _why_no_cell(
     fragments: dict[int, SubmapPacket | SubmapFragment], settings: ReconstructionSettings
 ) -> str:
@@ -141,7 +155,8 @@ def read_soundings(path: Path) -> tuple[list[Array], Track]:
     """
     try:
         with np.load(path) as data:
-            arrays = {name: np.asarray(data[name], dtype=np.float64) for name in data.files}
+            names = [name for name in (*_SOUNDINGS, *_TRACK) if name in data.files]
+            arrays = {name: data[name].astype(np.float64, casting="same_kind") for name in names}
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror or error}") from error
     except (ValueError, KeyError, EOFError, TypeError, AttributeError) as error:

@@ -196,6 +196,35 @@ def test_soundings_of_which_no_map_can_be_made_are_refused(
         compress_file(saved(tmp_path / "s.npz", soundings), tmp_path / "f.bin", "paper")
 
 
+@pytest.mark.parametrize("other", [np.array("a note"), np.array([None]), np.array([1j])])
+def test_arrays_beside_the_soundings_are_left_alone(
+    other: Array, survey: Survey, tmp_path: Path
+) -> None:
+    north_m, east_m, depth_m = survey.soundings_ned_m.T
+    columns = {"north_m": north_m, "east_m": east_m, "depth_m": depth_m, "time_s": survey.time_s}
+    np.savez(tmp_path / "s.npz", **columns, note=other)
+    compress_file(tmp_path / "s.npz", tmp_path / "f.bin", "lattice", settings=QUICK)
+    np.savez(tmp_path / "s.npz", **columns | {"north_m": np.resize(other, north_m.size)})
+    with pytest.raises(ConfigError, match="is not an npz of numeric arrays"):
+        compress_file(tmp_path / "s.npz", tmp_path / "f.bin", "lattice", settings=QUICK)
+
+
+@pytest.mark.parametrize("kind", [np.int32, np.uint16, np.float32])
+def test_soundings_of_any_number_kind_are_read(kind: type, survey: Survey, tmp_path: Path) -> None:
+    whole: Array = np.abs(np.round(survey.soundings_ned_m)).astype(kind)
+    soundings = saved(tmp_path / "s.npz", whole, survey.time_s)
+    compress_file(soundings, tmp_path / "f.bin", "lattice", settings=QUICK)
+
+
+def test_small_frames_that_the_track_fills_are_refused(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    area = rng.uniform([-40.0, -60.0], [40.0, 60.0], (4000, 2))
+    soundings = saved(tmp_path / "s.npz", np.column_stack([area, relief_m(*area.T)]))
+    with pytest.raises(ConfigError, match=r"makes no map in 10 frames of 62 bytes.*track_time_s"):
+        compress_file(soundings, tmp_path / "f.bin", "lattice", small=True)
+    assert not (tmp_path / "f.bin").exists()
+
+
 def test_files_that_hold_something_else_are_refused(tmp_path: Path) -> None:
     text = tmp_path / "text.npz"
     text.write_text("no arrays here")

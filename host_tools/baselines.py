@@ -15,12 +15,16 @@ from firmware.leader.reconstruction import Reconstruction
 from firmware.soundings import Odometry, Ping
 from firmware.submap_builder import SubmapBuilder
 from firmware.submaps import Submap
-from host_tools.nodes import Steps
+from host_tools.nodes import Node, Steps
 from host_tools.octree import decode_octree, octree_submap
+from protocol.acoustics import Delivery
+from protocol.codec import decode
 from protocol.errors import ConfigError, EstimationError
-from protocol.reassembly import SubmapTransfer
+from protocol.packets import SubmapFragment, SubmapPacket
+from protocol.reassembly import Key, SubmapTransfer
+from protocol.vehicles import LEADER
 
-Key = tuple[int, int, int]
+HEARD = ("delivered", "duplicate")
 MOST_CHUNKS = 10  # a sub-map's share of the air
 
 
@@ -86,6 +90,37 @@ def unlimited(originals: Originals, cell_m: float) -> Rebuild:
         )
 
     return rebuild
+
+
+class Unheard:
+    """Hands to the leader, with the last frame of a sub-map, what was lost where most of it was.
+
+    Otherwise the leader would not know that there is such a sub-map, or where it lies. No ranges
+    come with frames that nobody heard. It is told of every delivery in turn, and holds the lost
+    frames of one sub-map of each follower.
+    """
+
+    def __init__(self, leader: Node) -> None:
+        self._leader = leader
+        self._newest: dict[int, tuple[Key, list[bytes]]] = {}
+
+    def note(self, delivery: Delivery) -> None:
+        """Take what became of a frame at a receiver."""
+        packet = decode(delivery.frame)
+        if delivery.destination != LEADER or not isinstance(packet, SubmapPacket | SubmapFragment):
+            return
+        header = packet.header
+        key = (header.vehicle, header.boot_epoch, header.submap)
+        newest, lost = self._newest.get(delivery.source, (None, []))
+        if newest != key:
+            lost = []
+            self._newest[delivery.source] = key, lost
+        if delivery.fate not in HEARD:
+            lost.append(delivery.frame)
+        is_last = header.fragment == header.fragment_count - 1
+        if is_last and 2 * len(lost) > header.fragment_count:
+            for frame in lost:
+                self._leader.hear(frame, None, delivery.t_delivered_s)
 
 
 def octree(originals: Originals) -> Rebuild:

@@ -7,6 +7,7 @@ from typing import Never
 
 from tqdm import tqdm
 
+from host_tools.baselines import Unheard
 from host_tools.collect import mission_result
 from host_tools.commands import Command, add_mission_arguments, settings_of
 from host_tools.evaluation import Evaluation, evaluate
@@ -37,12 +38,19 @@ def simulate(
     vehicles = simulated_vehicles(settings, site, seed, truth_map.add)
     leader, followers = local_nodes(settings, vehicles, baseline, store)
     deliveries: list[Delivery] = []
+    unheard = Unheard(leader) if baseline == "unlimited" else None
+
+    def record(delivery: Delivery) -> None:
+        deliveries.append(delivery)
+        if unheard is not None:
+            unheard.note(delivery)
+
     run(
         {0: leader, **{node.core.vehicle: node for node in followers}},
         water_between(settings, vehicles, seed),
         duration_s=scenario.duration_s,
         tick_s=scenario.tick_s,
-        record=deliveries.append,
+        record=record,
         progress=progress,
     )
     close_stores([leader, *followers])

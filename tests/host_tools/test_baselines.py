@@ -83,3 +83,19 @@ def test_octrees_travel_whole_whatever_the_default_profile_needs() -> None:
     status = result.counters["leader"]
     assert status["reassembly_complete"] >= 2
     assert status.get("submaps_not_rebuilt", 0) == 0
+
+
+@pytest.mark.parametrize("profile", ["lattice", "paper"])
+def test_unlimited_loses_no_submap_whatever_the_water_does(profile: str) -> None:
+    parser = argparse.ArgumentParser()
+    add_mission_arguments(parser)
+    short = ["--set", "duration_min=4", "--set", "follower_duration_min=4", "--set", "beams=48"]
+    arguments = parser.parse_args(
+        ["--baseline", "unlimited", "--profile", profile, "--loss", "0.9", *short]
+    )
+    result = simulate(settings_of(arguments), None, arguments.seed, arguments.baseline)
+    status = result.counters["leader"]
+    assert status["reassembly_complete"] == 4  # the fifth is yet to be sent
+    assert status.get("submaps_off_track", 0) == 0
+    assert {patch.vehicle for patch in result.patches} == {0, 1}
+    assert sum(d.fate == "lost" for d in result.deliveries) > 40

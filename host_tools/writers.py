@@ -22,7 +22,8 @@ from protocol.errors import ConfigError
 NODATA = -9999.0
 CLOSURE_COLUMNS = (
     "t_s,from_vehicle,from_submap,to_vehicle,to_submap,measured_north_m,measured_east_m,"
-    "true_north_m,true_east_m,residual,stage,active_at_end,sigma_north_m,sigma_east_m,axis_deg"
+    "true_north_m,true_east_m,residual,stage,active_at_end,sigma_north_m,sigma_east_m,axis_deg,"
+    "from_time_s,to_time_s"
 ).split(",")
 # From the body (forward, starboard, down) to (forward, left, up), and from NED to ENU.
 FLIP = np.diag([1.0, -1.0, -1.0])
@@ -95,7 +96,7 @@ def body_quaternions(yaw_pitch_roll_rad: Array) -> Array:
 
 
 def write_closures(closures: Sequence[JudgedClosure], path: Path) -> None:
-    """Write closures.csv."""
+    """Write closures.csv; from_time_s and to_time_s say which states of the tracks each links."""
     with path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)
         writer.writerow(CLOSURE_COLUMNS)
@@ -121,6 +122,8 @@ def write_closures(closures: Sequence[JudgedClosure], path: Path) -> None:
                     f"{closure.sigma_north_m:.3f}",
                     f"{closure.sigma_east_m:.3f}",
                     "" if closure.axis_deg is None else f"{closure.axis_deg:.2f}",
+                    f"{closure.from_time_s:.3f}",
+                    f"{closure.to_time_s:.3f}",
                 ]
             )
 

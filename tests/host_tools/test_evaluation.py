@@ -316,6 +316,24 @@ def test_outputs_are_those_of_the_contract(mission: MissionResult, tmp_path: Pat
     assert summary["datum"]["shift_m"] == mission.site.datum.depth_shift_m
 
 
+def test_true_columns_of_closures_follow_from_the_tum_files(
+    mission: MissionResult, tmp_path: Path
+) -> None:
+    write_outputs(mission, evaluate(mission), tmp_path)
+    names = {"0": "leader", "1": "follower_1"}
+    tracks = {key: np.loadtxt(tmp_path / f"{name}_truth.tum") for key, name in names.items()}
+
+    def at(vehicle: str, time_s: str) -> np.ndarray:
+        rows = tracks[vehicle]
+        return np.array([np.interp(float(time_s), rows[:, 0], rows[:, axis]) for axis in (2, 1)])
+
+    for row in csv.DictReader((tmp_path / "closures.csv").read_text().splitlines()):
+        true_m = at(row["to_vehicle"], row["to_time_s"])
+        true_m -= at(row["from_vehicle"], row["from_time_s"])
+        stated_m = [float(row["true_north_m"]), float(row["true_east_m"])]
+        np.testing.assert_allclose(true_m, stated_m, atol=0.002)
+
+
 def test_tum_lines_lie_on_one_grid_in_projected_enu(mission: MissionResult, tmp_path: Path) -> None:
     write_outputs(mission, evaluate(mission), tmp_path)
     rows = np.loadtxt(tmp_path / "follower_1_truth.tum")

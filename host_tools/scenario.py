@@ -7,7 +7,7 @@ from pathlib import Path
 
 from protocol.acoustics import WaterSettings
 from protocol.errors import ConfigError
-from protocol.settings import Settings, flatten, replace, setting
+from protocol.settings import Settings, replace, setting
 
 KNOT_MPS = 1852.0 / 3600.0
 MOST_TICKS_HZ = 40
@@ -211,7 +211,7 @@ def load_scenario(name_or_path: str) -> ScenarioSettings:
     ConfigError
         For a file that cannot be read or parsed, an unknown name or key, or a value out of bounds.
     """
-    if not name_or_path.endswith(".toml"):
+    if not name_or_path.lower().endswith(".toml"):
         return named_scenario(name_or_path)
     path = Path(name_or_path)
     try:
@@ -225,10 +225,9 @@ def load_scenario(name_or_path: str) -> ScenarioSettings:
     if not isinstance(water, dict):
         raise ConfigError(f"{path}: water is {water!r}; write its keys under [water]")
     table |= {f"water.{key}": value for key, value in water.items()}
-    known = [key for key, *_ in flatten(base)]
-    for key in table:
-        if key not in known and f"water.{key}" not in known:
-            raise ConfigError(f"{path}: unknown key {key!r}; known keys: base, {', '.join(known)}")
-    scenario = replace(base, {"name": path.stem, **table})
+    try:
+        scenario = replace(base, {"name": path.stem, **table})
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
     scenario.check()
     return scenario

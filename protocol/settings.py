@@ -136,6 +136,8 @@ def _read(name: str, value: object, kind: Any) -> object:  # noqa: ANN401
             return text in {"true", "yes", "on", "1"}
         raise ConfigError(f"{name} is {value!r}; write true or false")
     try:
+        if isinstance(value, bool) and kind in {int, float}:
+            raise ValueError
         if kind is int and not isinstance(value, str) and value != int(value):  # type: ignore[call-overload]
             raise ValueError
         return kind(value)

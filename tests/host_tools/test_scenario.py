@@ -50,7 +50,11 @@ def test_toml_file_changes_its_base(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("speed = 3", "unknown key 'speed'; known keys: base, name, duration_min"),
+        ("speed = 3", "bad.toml: unknown setting 'speed'; did you mean speed_mps"),
+        ("[water]\nlos = 0.1", "bad.toml: unknown setting 'water.los'; did you mean water.loss"),
+        ("[leader.graph]\nx = 2", "bad.toml: unknown setting 'leader'; `fathomlink config show`"),
+        ("duration_min = true", "bad.toml: duration_min is True; give a value of type float"),
+        ("beams = false", "bad.toml: beams is False; give a value of type int"),
         ("leg_m = [", "is not a TOML file"),
         ("leg_m = 1", "at least 20"),
         ("base = 'paper-3'", "choose one of paper-1, paper-2, field-1, day-1"),
@@ -63,6 +67,12 @@ def test_bad_scenario_file_is_a_clear_error(tmp_path: Path, text: str, message: 
     path.write_text(text)
     with pytest.raises(ConfigError, match=message):
         load_scenario(str(path))
+
+
+def test_toml_may_be_written_in_capitals(tmp_path: Path) -> None:
+    path = tmp_path / "SHORT.TOML"
+    path.write_text("duration_min = 12\n")
+    assert load_scenario(str(path)).duration_min == 12
 
 
 def test_unknown_scenario_names_the_choices() -> None:

@@ -1,13 +1,17 @@
 """Everything that `--set` reaches: the scenario, the air, and each vehicle's configuration."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 from firmware.follower.settings import FollowerSettings
 from firmware.leader.settings import LeaderSettings
 from host_tools.scenario import ScenarioSettings
-from protocol.schedule import SlotSettings
+from protocol.errors import ConfigError
+from protocol.schedule import Air, SlotSettings, planned_slots
 from protocol.settings import Settings, replace, setting
+
+_REACH_M = 1000.0  # that suggested slots are clear to
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,3 +38,21 @@ def changed(settings: MissionSettings, changes: Mapping[str, object]) -> Mission
         "leader.graph.start_sigma_m": told_m,
     }
     return replace(settings, derived)
+
+
+def check_air(settings: MissionSettings) -> None:
+    """Raise ConfigError where a frame sounds for longer than its slot at the water's rate."""
+    rate_bps, slots = settings.scenario.water.rate_bps, settings.slots
+    air = Air(frame_bytes=settings.follower.frame_bytes, rate_bps=rate_bps)
+    if air.frame_s <= slots.follower_slot_s:
+        return
+    least_bps = math.ceil(8.0 * air.frame_bytes / slots.follower_slot_s)
+    planned = planned_slots(slots.followers, _REACH_M, air)
+    offsets_s = ",".join(map(str, planned.leader_offsets_s))
+    raise ConfigError(
+        f"a frame of {air.frame_bytes} bytes sounds for {air.frame_s:.2f} s at rate_bps="
+        f"{rate_bps:g}, its slot has {slots.follower_slot_s} s; set rate_bps to {least_bps} or "
+        "more, or "
+        f"follower_slot_s={planned.follower_slot_s}, leader_period_s={planned.leader_period_s} and "
+        f"leader_offsets_s={offsets_s}"
+    )

@@ -13,7 +13,7 @@ from host_tools.commands import Command, add_mission_arguments, settings_of
 from host_tools.evaluation import Evaluation, evaluate
 from host_tools.mapping import DepthMap
 from host_tools.mission import Progress, local_nodes, run, simulated_vehicles, water_between
-from host_tools.mission_settings import MissionSettings
+from host_tools.mission_settings import MissionSettings, check_air
 from host_tools.report import write_report
 from host_tools.results import MissionResult
 from host_tools.simulator.placement import place_survey
@@ -32,6 +32,7 @@ def simulate(
     store: Path | None = None,
 ) -> MissionResult:
     """Return a whole mission, all vehicles in this process; they keep stores if asked to."""
+    check_air(settings)
     scenario = settings.scenario
     site = place_survey(open_terrain(terrain, scenario.relief_seed), scenario, seed)
     truth_map = DepthMap(site.window)

@@ -6,6 +6,7 @@ from firmware.compression.settings import BinningSettings, CompressionSettings
 from firmware.follower.correction import CorrectionSettings
 from firmware.soundings import SonarSettings
 from firmware.submap_builder import SubmapSettings
+from protocol.packets import FRAME_BYTES, SMALL_FRAME_BYTES
 from protocol.repeats import RepeatSettings
 from protocol.settings import Settings, setting
 
@@ -39,3 +40,10 @@ class FollowerSettings(Settings):
     track_s: float = setting(
         600.0, "s", "of own track kept to place answers by; they are two minutes old", minimum=60.0
     )
+
+    @property
+    def frame_bytes(self) -> int:
+        """The size of the frames that sub-maps are sent in."""
+        may_be_small = self.profile in {"lattice", "auto"}
+        is_small = may_be_small and self.compression.small_frames
+        return SMALL_FRAME_BYTES if is_small else FRAME_BYTES

@@ -14,7 +14,7 @@ from host_tools.commands import Command
 from host_tools.evaluation import evaluate
 from host_tools.mapping import DepthMap
 from host_tools.mission import Progress, run, simulated_vehicles, water_between
-from host_tools.processes.emulated_modems import MODEMS, EmulatedModems
+from host_tools.processes.emulated_modems import MODEMS, EmulatedModems, check_frames
 from host_tools.processes.fleet import Fleet, OnWait
 from host_tools.processes.pace import Pace
 from host_tools.processes.records import FOLDER, VehicleFiles
@@ -46,6 +46,7 @@ def host_mission(
     ready is called when the ports are there; on_wait while processes are missing. modems says what
     is at the ports: raw lines that carry frames, or emulated modems of a dialect.
     """
+    check_frames(modems, voyage.settings)
     vehicles = simulated_vehicles(voyage.settings, voyage.site, voyage.seed)
     water = water_between(voyage.settings, vehicles, voyage.seed)
     files = {vehicle: VehicleFiles(out, vehicle) for vehicle in water.nodes}

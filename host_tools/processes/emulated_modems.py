@@ -10,10 +10,14 @@ from host_tools.emulators.micromodem import MicroModemUnit
 from host_tools.emulators.nanomodem import NanomodemUnit
 from host_tools.emulators.ptys import PseudoPort
 from host_tools.mission import Progress
+from host_tools.mission_settings import MissionSettings, check_air
 from host_tools.processes.control import Advance, Done
 from host_tools.processes.remote_node import RemoteNode
 from protocol.acoustics import Delivery, Water
+from protocol.modems.dialect_driver import check_frame_size
 from protocol.modems.micromodem_settings import FRAMES_AND_BYTES
+from protocol.modems.nanomodem import FRAME_BYTES as NANOMODEM_FRAME_BYTES
+from protocol.packets import FRAME_BYTES
 
 MODEMS: dict[str, tuple[str, ...]] = {
     "raw": (),
@@ -32,9 +36,19 @@ MODEMS: dict[str, tuple[str, ...]] = {
 or frames of 62 bytes, 1.1 s long, and answers of 0.6 s between them, clear of each other to 1.2 km.
 """
 _BAUD = {"micromodem": 19_200, "nanomodem": 9_600}
+_LARGEST_FRAME_BYTES = {"micromodem": FRAME_BYTES, "nanomodem": NANOMODEM_FRAME_BYTES}
 HANDOVER_S = 2.0
 """Of real time: a kernel that has not passed bytes on by then has lost them."""
 NAP_S = 0.0001
+
+
+def check_frames(kind: str, settings: MissionSettings) -> None:
+    """Raise ConfigError when frames do not fit what is at the ports, or their slots."""
+    if kind == "raw":
+        check_air(settings)
+        return
+    follower = settings.follower
+    check_frame_size(_LARGEST_FRAME_BYTES[kind], follower.frame_bytes, follower.profile)
 
 
 def address_of(vehicle: int) -> int:

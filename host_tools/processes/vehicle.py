@@ -48,7 +48,6 @@ from protocol.modems.base import Modem, ModemContext
 from protocol.modems.dialect_driver import DialectDriver, await_identified, check_frame_size
 from protocol.modems.registry import open_modem
 from protocol.modems.sealed import SealedLink, SealedModem
-from protocol.packets import FRAME_BYTES, SMALL_FRAME_BYTES
 from protocol.vehicles import BOOT_EPOCHS, LEADER
 
 LOG = logging.getLogger(__name__)
@@ -97,11 +96,8 @@ def run_vehicle(
     files = None if out is None else VehicleFiles(out, vehicle)
     starts = None if files is None else files.prepare()
     try:
-        profile = voyage.settings.follower.profile
-        may_be_small = profile in {"lattice", "auto"}
-        is_small = may_be_small and voyage.settings.follower.compression.small_frames
-        frame_bytes = SMALL_FRAME_BYTES if is_small else FRAME_BYTES
-        check_frame_size(modem.largest_frame_bytes, frame_bytes, profile)
+        follower = voyage.settings.follower
+        check_frame_size(modem.largest_frame_bytes, follower.frame_bytes, follower.profile)
         ticks = clock.ticks(voyage.tick_s)
         first_s = next(ticks, None)
         if first_s is None and not is_at_sea:

@@ -54,6 +54,11 @@ def test_pings_at_any_rate_leave_answers_and_outputs_on_whole_seconds(
         (["--scenario", "paper-3"], "choose one of"),
         (["--set", "leg_m=9000", "--set", "duration_min=90"], "shorten it"),
         (["--out", "/dev/null/out"], "cannot write to --out"),
+        (
+            ["--set", "rate_bps=100"],
+            "256 bytes sounds for 20.48 s at rate_bps=100, its slot has 4 s; "
+            "set rate_bps to 512 or more, or follower_slot_s=",
+        ),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(

@@ -115,10 +115,11 @@ def test_a_mission_of_small_lattice_frames_on_emulated_nanomodems(tmp_path: Path
     assert summary["closures"]["active"]["number"] >= 5
 
 
+@pytest.mark.parametrize("command", ["demo", "channel"])
 def test_nanomodems_refuse_the_papers_frames_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = ["demo", "--modems", "nanomodem", "--profile", "paper", "--set", "duration_min=1"]
+    run = [command, "--modems", "nanomodem", "--profile", "paper", "--set", "duration_min=1"]
     run += ["--out", str(tmp_path)]
     assert main(run) == 2
     error = capsys.readouterr().err

@@ -164,13 +164,11 @@ def write_map(path: Path, site: Site, depth_m: Array, sigma_m: Array) -> None:
         "compress": "deflate",
         "tiled": True,
     }
-    blank = np.full((raster.rows, raster.columns), NODATA, dtype=np.float32)
     at = RasterWindow(window.left_column, window.top_row, window.columns, window.rows)
     with rasterio.open(path, "w", **profile) as dataset:
         for band, name, layer in ((1, "elevation", elevation_m), (2, "deviation", sigma_m)):
             filled = np.nan_to_num(layer[::-1], nan=NODATA).astype(np.float32)
-            dataset.write(blank, band)
-            dataset.write(filled, band, window=at)
+            dataset.write(filled, band, window=at)  # blocks never written hold no data
             dataset.set_band_description(band, f"{name}_m")
 
 

@@ -1,6 +1,8 @@
 import csv
+import dataclasses
 import json
 import re
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +24,7 @@ from host_tools.scenario import ScenarioSettings, named_scenario
 from host_tools.simulator.placement import Site, Window, place_survey
 from host_tools.simulator.terrain import open_terrain
 from host_tools.simulator.vehicle import SimulatedVehicle, TrueTrack
-from host_tools.writers import body_quaternions, prepare_folder, write_outputs
+from host_tools.writers import body_quaternions, prepare_folder, write_map, write_outputs
 from protocol.acoustics import Delivery
 from protocol.errors import ConfigError
 from protocol.settings import replace
@@ -360,6 +362,22 @@ def test_map_of_true_soundings_lies_on_the_terrain(mission: MissionResult, tmp_p
     assert float(difference_m.std()) < 0.25
     assert sigma_m.count() == elevation_m.count()
     assert evaluation.registration.mean_m < 1e-2
+
+
+def test_map_takes_memory_by_the_survey_not_by_the_terrain(
+    mission: MissionResult, tmp_path: Path
+) -> None:
+    wide = dataclasses.replace(mission.site.raster, rows=8000, columns=8000)
+    site = dataclasses.replace(mission.site, raster=wide)
+    window = site.window
+    depth_m = np.full((window.rows, window.columns), 30.0)
+    tracemalloc.start()
+    write_map(tmp_path / "map.tif", site, depth_m, depth_m)
+    assert tracemalloc.get_traced_memory()[1] < 50e6  # bytes; a whole band would have 256e6
+    tracemalloc.stop()
+    with rasterio.open(tmp_path / "map.tif") as dataset:
+        assert dataset.shape == (8000, 8000)
+        assert dataset.read(1, masked=True).count() == depth_m.size
 
 
 def test_report_is_one_file_that_needs_no_other(mission: MissionResult, tmp_path: Path) -> None:

@@ -2,8 +2,9 @@
 
 Source: paper, section 4.2: Gaussian process regression (Eq. 5, 6) inside the outer edges of the
 points' Delaunay triangulation; depths with a variance above 0.1 are dropped. That is the map's own
-variance, without sigma^2 of the soundings: else nothing were left of a survey from 100 m above the
-seabed. A lattice tells one variance, that of soundings about it all, and nothing of it is dropped.
+variance, without sigma^2 of the soundings as far as noise may explain it: else nothing were left of
+a survey from 100 m above the seabed. A lattice tells one variance, that of soundings about it all,
+and nothing of it is dropped.
 """
 
 from collections.abc import Mapping
@@ -43,6 +44,12 @@ class ReconstructionSettings(Settings):
     )
     max_variance_m2: float = setting(
         0.1, "m2", "paper, 4.2: above it depths are dropped", minimum=0.0
+    )
+    max_noise_m2: float = setting(
+        1.0,
+        "m2",
+        "of soundings, 100 to 200 m deep; what is more, a fit could not follow",
+        minimum=0.0,
     )
     max_cells: int = setting(
         1_000_000, "cells", "25 MB; a swath at 1 m has 22,500", minimum=100, maximum=10_000_000
@@ -188,7 +195,8 @@ def reconstruct_points(
     north_m, east_m = _axes(points[:, :2], settings)
     inside = _inside(points[:, :2], north_m, east_m)
     depth_m, variance_m2 = gridded(decoder, north_m, east_m, inside)
-    depth_m[variance_m2 - hyper.sigma2_m2 > settings.max_variance_m2] = np.nan
+    noise_m2 = min(hyper.sigma2_m2, settings.max_noise_m2)
+    depth_m[variance_m2 - noise_m2 > settings.max_variance_m2] = np.nan
     variance_m2[np.isnan(depth_m)] = np.nan
     return GriddedSubmap(
         north0_m=float(north_m[0]),

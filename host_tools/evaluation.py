@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware.geometry import Array
-from host_tools.mapping import DepthMap
+from host_tools.mapping import DepthMap, displaced_sigma_m
 from host_tools.registration import (
     RegistrationError,
     TileShifts,
@@ -90,6 +90,7 @@ def evaluate(result: MissionResult) -> Evaluation:
     map_m, sigma_m = drawn.grids(FILL_M)
     truth_m, truth_sigma_m = result.truth_map.grids(FILL_M)
     window = result.site.window
+    sigma_m = displaced_sigma_m(map_m, sigma_m, _position_m2(result), window)
     return Evaluation(
         vehicles={
             vehicle.name: vehicle_errors(vehicle, result.scenario.survey_s(vehicle.vehicle))
@@ -103,6 +104,19 @@ def evaluate(result: MissionResult) -> Evaluation:
         registration=registration_error(map_m, truth_m),
         tiles=tile_shifts(map_m, truth_m, window.cell_north_m, window.cell_east_m),
     )
+
+
+def _position_m2(result: MissionResult) -> Array:
+    """Return the mean covariance (2, 2) of where the final estimate has its soundings."""
+    told = [
+        vehicle.final_covariance_m2[
+            vehicle.truth.time_s <= result.scenario.survey_s(vehicle.vehicle)
+        ]
+        for vehicle in result.vehicles
+        if vehicle.final_covariance_m2 is not None
+    ]
+    known = [c for covariances in told for c in covariances if np.isfinite(c).all()]
+    return np.mean(known, axis=0) if known else np.zeros((2, 2))
 
 
 def vehicle_errors(vehicle: VehicleResult, survey_s: float) -> VehicleErrors:

@@ -86,3 +86,16 @@ class DepthMap:
         near[:, np.round(near[0]) == 0] = 0.0
         filled: NDArray[np.float64] = np.where(self._sums[0] > 0, self._sums, near)
         return filled
+
+
+def displaced_sigma_m(depth_m: Array, sigma_m: Array, position_m2: Array, window: Window) -> Array:
+    """Return the sigma (rows, columns) of depths that were measured a little way off.
+
+    position_m2 (2, 2) is the covariance of where they lie, north and east: felt on slopes. Next to
+    what is unknown no slope is told, and sigma stays.
+    """
+    if min(depth_m.shape) < 2:
+        return sigma_m
+    slopes = np.asarray(np.gradient(depth_m, window.cell_north_m, window.cell_east_m))
+    added_m2 = np.einsum("irc,ij,jrc->rc", slopes, position_m2, slopes)
+    return np.asarray(np.sqrt(sigma_m**2 + np.nan_to_num(added_m2)))

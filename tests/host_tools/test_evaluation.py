@@ -16,7 +16,7 @@ from host_tools.evaluation import (
     mean_nees,
     vehicle_errors,
 )
-from host_tools.mapping import DepthMap
+from host_tools.mapping import DepthMap, displaced_sigma_m
 from host_tools.registration import registration_error, tile_shifts
 from host_tools.report import write_report
 from host_tools.results import ClosureResult, MissionResult, SoundingPatch, VehicleResult
@@ -149,6 +149,15 @@ def test_holes_of_a_grid_finer_than_its_soundings_are_filled_near_soundings_only
     assert np.isfinite(depth_m[10:38, 10:38]).all()
     assert np.isnan(depth_m[50:, 50:]).all()
     np.testing.assert_allclose(depth_m[20, 20], 40.0, atol=1.1)
+
+
+def test_a_map_is_as_unsure_as_its_slopes_make_of_where_it_lies() -> None:
+    window = dataclasses.replace(small_window(6, 8, 2.0), cell_east_m=5.0)
+    plane_m = 40.0 + 0.1 * 2.0 * np.arange(6)[:, None] + np.zeros(8)
+    plane_m[0, 0] = np.nan
+    sigma_m = displaced_sigma_m(plane_m, np.full((6, 8), 0.04), np.diag([9.0, 100.0]), window)
+    assert sigma_m[3, 4] == pytest.approx(np.hypot(0.04, 0.3))
+    assert sigma_m[1, 0] == pytest.approx(0.04)
 
 
 def test_patches_move_with_the_final_trajectory_at_the_time_they_were_measured() -> None:

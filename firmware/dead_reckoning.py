@@ -7,7 +7,7 @@ from firmware.soundings import Odometry
 
 _SET_BACK_SAMPLES = 5  # back in time one after the other: it is the clock that was set back
 _LONGEST_STEP_S = 5.0  # a longer gap is not bridged with one velocity: the position is held
-FASTEST_LOST_MPS = 3.0
+LOST_SIGMA_MPS = 3.0
 """Sigma, each axis, of how far a survey vehicle goes while nobody measures it."""
 
 

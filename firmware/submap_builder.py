@@ -80,8 +80,9 @@ class SubmapBuilder:
         self._bins.add(soundings_ned_m, ping.time_s)
 
     def tear(self, state: ReckonedState) -> None:
-        """Forget what was measured of this sub-map: nobody knows how it lies to what follows."""
-        self._begin()
+        """End the sub-map here: nobody knows how it lies to what follows."""
+        if self._states:
+            self._close(state)
         self._window = self._window_of(state)
 
     def take(self) -> Submap | None:

@@ -19,7 +19,7 @@ from host_tools.nodes import Node, Steps
 from host_tools.octree import decode_octree, octree_submap
 from protocol.acoustics import Delivery
 from protocol.codec import decode
-from protocol.errors import ConfigError, EstimationError
+from protocol.errors import ConfigError, EstimationError, RemoteProtocolError
 from protocol.packets import SubmapFragment, SubmapPacket
 from protocol.reassembly import Key, SubmapTransfer
 from protocol.vehicles import LEADER
@@ -106,7 +106,10 @@ class Unheard:
 
     def note(self, delivery: Delivery) -> None:
         """Take what became of a frame at a receiver."""
-        packet = decode(delivery.frame)
+        try:
+            packet = decode(delivery.frame)
+        except RemoteProtocolError:  # damaged on its way: what it was nobody knows
+            return
         if delivery.destination != LEADER or not isinstance(packet, SubmapPacket | SubmapFragment):
             return
         header = packet.header

@@ -140,7 +140,8 @@ def _why_no_cell(
             "give a smaller --cell"
         )
     return (
-        f"no depth has a variance up to {most_m2:g} m2, the least is {np.nanmin(variance_m2):.2g}; "
+        f"no depth is known to {most_m2:g} m2 beyond its soundings' noise, the best to "
+        f"{np.nanmin(variance_m2):.2g} with it; "
         "drop fewer frames, or compress more soundings, less rough ones, or as another --profile"
     )
 

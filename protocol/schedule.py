@@ -85,8 +85,7 @@ class Turns:
         self._frames = 1 if is_leader else settings.frames_per_slot
         turn_s = settings.follower_slot_s * settings.followers
         self._apart_s = settings.leader_period_s if is_leader else turn_s
-        self._next_s = start_s
-        self.skip(start_s - _PAST_S)
+        self._next_s, self._left = slots.next_slot_s(vehicle, start_s), self._frames
 
     def due_s(self, now_s: float) -> float | None:
         """Return the slot that begins now, once for each frame that it holds, or else None."""

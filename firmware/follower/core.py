@@ -83,7 +83,10 @@ class FollowerCore:
 
     def receive_odometry(self, odometry: Odometry) -> None:
         """Advance dead reckoning; a finished sub-map goes to the fit."""
+        before = self._reckoning.state
         state = self._reckoning.receive_odometry(odometry)
+        if state is before:
+            return
         while self._track and self._track[-1].time_s > state.time_s:  # the clock was set back
             self._track.pop()
             self._last_submap_s = min(self._last_submap_s, state.time_s)
@@ -182,9 +185,12 @@ class FollowerCore:
         }
 
     def _lose(self, state: ReckonedState) -> None:
-        """Doubt the way since the last state, and forget the sub-map that it tears."""
+        """Doubt the way since the last state, and send what was measured before it by itself."""
         self._is_lost = True
         self._builder.tear(state)
+        torn = self._builder.take()
+        if torn is not None:
+            self._begin_fit(torn)
         self._correction.lose(state.time_s - self._reckoning.lost_s, state.time_s)
 
     def _begin_boot(self) -> None:

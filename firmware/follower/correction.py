@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from firmware.dead_reckoning import LOST_SIGMA_MPS
 from firmware.follower.drift_filter import (
     AnswerSeen,
     DriftFilter,
@@ -27,7 +28,7 @@ from protocol.settings import setting
 
 _CHI_SQUARE_1_99, _CHI_SQUARE_2_999 = 6.6, 13.8  # shares of true innovations that lie below
 _LEAST_NEWS = 0.05  # an answer hardly surer than dead reckoning alone is left out
-_KEPT = 96  # answers and ranges of eight minutes; older ones are in the filter's beginning
+_KEPT = 96  # answers, ranges and losses of eight minutes; older ones are in the beginning
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,6 +76,7 @@ class DriftCorrection:
         self._deployment = self._base = self._filter.deployed(start_time_s)
         self._seen: list[_Filtered] = []
         self._lost: list[LostSpan] = []
+        self._losing_s = (np.inf, -np.inf)  # the newest lost span, as far as it was told
         self._aside: AnswerSeen | None = None
         self._echo = False  # the newest answer may be dead reckoning again
         self.empty = 0
@@ -155,17 +157,23 @@ class DriftCorrection:
         return True
 
     def lose(self, begin_s: float, end_s: float) -> None:
-        """Doubt a span of which nobody knows how far the vehicle went."""
-        if self._lost and begin_s <= self._lost[-1].time_s:
-            begun = self._lost.pop()
-            begin_s = begun.time_s - begun.span_s
-            self._forget(begun)
-        self._lost.append(LostSpan(time_s=end_s, span_s=end_s - begin_s))
+        """Doubt a span of which nobody knows how far the vehicle went, and what it goes on from."""
+        if not self._losing_s[0] <= begin_s <= self._losing_s[1] <= end_s:
+            self._losing_s = begin_s, begin_s
+        begun_s, told_s = self._losing_s
+        self._losing_s = begun_s, end_s
+        added_m2 = LOST_SIGMA_MPS**2 * ((end_s - begun_s) ** 2 - (told_s - begun_s) ** 2)
+        newest = self._seen[-1].one if self._seen else None
+        if isinstance(newest, LostSpan) and newest.time_s == told_s:
+            self._lost.remove(newest)
+            self._forget(newest)
+            added_m2 += newest.variance_m2
+        self._lost.append(LostSpan(time_s=end_s, variance_m2=added_m2))
         self._take(self._lost[-1])
         if len(self._lost) > _KEPT:
             first, second = self._lost[:2]
-            both_s = second.time_s - first.time_s + first.span_s
-            self._lost[:2] = [LostSpan(time_s=second.time_s, span_s=both_s)]
+            both_m2 = first.variance_m2 + second.variance_m2
+            self._lost[:2] = [LostSpan(time_s=second.time_s, variance_m2=both_m2)]
 
     def corrected(self, time_s: float, reckoned_m: Array) -> tuple[Array, Array]:
         """Return the believed position (2,) at the time, and its covariance (2, 2)."""

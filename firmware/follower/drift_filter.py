@@ -1,4 +1,4 @@
-"""A bank of Kalman filters over drift: how far dead reckoning ran away, how fast, and other errors.
+"""A bank of Kalman filters over drift: how far dead reckoning ran away, and how fast.
 
 The state is (c, b, v), each with north and east: c in metres and b in metres a second are dead
 reckoning's; v is the error of the leader's own position, in units of the sigma that is told with
@@ -8,7 +8,7 @@ An answer is an estimate, not a measurement: it holds all that the leader was ev
 that earlier answers held. What is new in it is by how much it is surer than this filter; only that
 counts, however often it is said. Errors of two estimates of which the later holds what the earlier
 one held are correlated by the ratio of their sigmas: the difference of both has the difference of
-both variances.
+both variances. Where the filter is the surer one, it learns nothing.
 
 How much b wanders differs from sea to sea, and nobody knows it beforehand. Each filter of the bank
 takes another walk for granted, and has the weight that what was seen gives to it: multiple-model
@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from firmware.dead_reckoning import FASTEST_LOST_MPS
 from firmware.geometry import Array
 from protocol.settings import Settings, setting
 
@@ -79,15 +78,13 @@ class RangeSeen:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LostSpan:
-    """A span up to the time, of which nobody knows how far the vehicle went: its length."""
+    """What a span up to the time, of which nobody knows how far the vehicle went, adds: a variance.
+
+    A longer one comes in parts: then each has what it adds to those before it.
+    """
 
     time_s: float
-    span_s: float
-
-    @property
-    def variance_m2(self) -> float:
-        """The variance of the way, each axis."""
-        return (FASTEST_LOST_MPS * self.span_s) ** 2
+    variance_m2: float
 
 
 Seen = AnswerSeen | RangeSeen | LostSpan

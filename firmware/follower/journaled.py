@@ -109,6 +109,8 @@ class JournaledFollower(FollowerCore):
             poll=super().poll,
         )
         self.recorder.replay(plain, _refuse)
+        if self.boot_epoch != self.recorder.journal.boot_epoch:
+            self.recorder.journal.count_epoch(self.boot_epoch)
 
 
 def _refuse(kind: int, body: bytes) -> None:

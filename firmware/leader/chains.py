@@ -1,17 +1,18 @@
 """The nodes of one vehicle in the pose graph, and what ties those of two vehicles in one water."""
 
 import bisect
+import itertools
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware.dead_reckoning import FASTEST_LOST_MPS
+from firmware.dead_reckoning import LOST_SIGMA_MPS
 from firmware.geometry import Array
 from firmware.leader.ledger import OdometryRecord, SharedWalkRecord
 from firmware.leader.trajectory import Trajectory
 
-_MOST_SPANS = 256  # of lost navigation; beyond it the oldest two become one, and what lies between
+_MOST_SPANS = 1024  # of lost navigation; of more the two nearest become one, with what is between
 
 
 @dataclass(slots=True)
@@ -36,11 +37,13 @@ class Chain:
 
     def lose(self, begin_s: float, end_s: float) -> None:
         """Remember a span of which nobody knows how far the vehicle went; bounded."""
-        if self.lost and begin_s <= self.lost[-1][1]:
+        if self.lost and begin_s <= self.lost[-1][1] <= end_s:
             begin_s = self.lost.pop()[0]
         self.lost.append((begin_s, end_s))
         if len(self.lost) > _MOST_SPANS:
-            self.lost[:2] = [(self.lost[0][0], self.lost[1][1])]
+            gaps_s = [after[0] - before[1] for before, after in itertools.pairwise(self.lost)]
+            k = int(np.argmin(gaps_s))
+            self.lost[k : k + 2] = [(self.lost[k][0], self.lost[k + 1][1])]
 
     def lost_m2(self, begin_s: float, end_s: float) -> float:
         """Return the variance, each axis, that lost spans add to the way in an interval.
@@ -49,7 +52,7 @@ class Chain:
         not with its root.
         """
         ends_s = ((b, min(max(begin_s, b), e), min(max(end_s, b), e)) for b, e in self.lost)
-        return FASTEST_LOST_MPS**2 * sum((y - b) ** 2 - (x - b) ** 2 for b, x, y in ends_s)
+        return LOST_SIGMA_MPS**2 * sum((y - b) ** 2 - (x - b) ** 2 for b, x, y in ends_s)
 
     def key_at(self, time_s: float) -> int | None:
         """Return the key of the node at exactly this time, or None."""

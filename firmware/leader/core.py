@@ -270,10 +270,13 @@ class LeaderCore:
         self.outlook.note(newest_s)
 
     def _lose(self, state: ReckonedState) -> None:
-        """Doubt the way since the last state, and forget the sub-map that it tears."""
-        self.graph.lose(LEADER, state.time_s - self._reckoning.lost_s, state.time_s)
+        """Doubt the way since the last state; what was measured before it stands by itself."""
         self._builder.tear(state)
+        torn = self._builder.take()
+        if torn is not None:
+            self._add_own(torn)
         self._stretches.clear()
+        self.graph.lose(LEADER, state.time_s - self._reckoning.lost_s, state.time_s)
 
     def _add_own(self, stretch: Submap) -> None:
         """Join the newest stretches to a sub-map, so that one ends every hop."""

@@ -1,9 +1,10 @@
 """The followers as the leader knows them: one chain of the graph for each boot of each vehicle.
 
-A vehicle that restarts counts its sub-maps from zero and may begin dead reckoning anew. What was
-known of it stays where it is; the new boot is a chain of its own, tied to the old one by how far
-the vehicle can have come meanwhile. A boot is the header's epoch, unrolled; dead reckoning that
-jumps for good without a restart is taken for a boot of the same epoch.
+A vehicle that restarts counts its sub-maps from zero and may begin dead reckoning anew; one whose
+navigation was lost for a while calls that a boot, too. What was known of it stays where it is; the
+new boot is a chain of its own, tied to the old one by how far the vehicle can have come meanwhile.
+A boot is the header's epoch, unrolled; dead reckoning that jumps for good without a restart is
+taken for a boot of the same epoch.
 """
 
 from collections import Counter, deque
@@ -25,6 +26,7 @@ from protocol.settings import Settings, setting
 from protocol.timestamps import from_quarters
 from protocol.vehicles import BOOT_EPOCHS, LEADER
 
+_HELD_M = 1.0  # dead reckoning that stands still was held while navigation was lost
 _CONTINUES_M = 3.0  # dead reckoning that goes on lies this near to a straight continuation
 
 
@@ -84,10 +86,7 @@ class Fleet:
         if (
             ahead >= BOOT_EPOCHS // 2
             and earlier >= 0
-            and (
-                chain_of(header.vehicle, earlier) in self._tracks
-                or self._precedes(header, chain_of(header.vehicle, known.boot))
-            )
+            and self._is_late(header, known.boot, earlier)
         ):
             return earlier
         if ahead:
@@ -211,11 +210,11 @@ class Fleet:
             self.counters["lasting_jumps"] += 1
         return None
 
-    def _precedes(self, header: Header, chain: int) -> bool:
-        """Return whether a frame speaks of a time before a chain began."""
-        buffer = self._tracks.get(chain)
+    def _is_late(self, header: Header, boot: int, earlier: int) -> bool:
+        """Return whether a frame is of an earlier boot: by its time where the newest has begun."""
+        buffer = self._tracks.get(chain_of(header.vehicle, boot))
         if buffer is None or not len(buffer):
-            return False
+            return chain_of(header.vehicle, earlier) in self._tracks
         begun_s = float(buffer.track().time_s[0])
         return from_quarters(header.time_quarters, begun_s) < begun_s
 
@@ -236,7 +235,8 @@ class Fleet:
         moved_m, sigma_m = np.zeros(2), self._settings.fastest_mps / 2 * gap_s + 5.0
         velocity_mps = (old.position_at(last_s) - old.position_at(last_s - 5.0)) / 5.0
         on_m = start_m - old.position_at(last_s)
-        if np.hypot(*(on_m - velocity_mps * gap_s)) < _CONTINUES_M + 0.2 * np.sqrt(gap_s):
+        goes_on = np.hypot(*(on_m - velocity_mps * gap_s)) < _CONTINUES_M + 0.2 * np.sqrt(gap_s)
+        if goes_on and np.hypot(*on_m) > _HELD_M:
             moved_m, sigma_m = on_m - trajectory.bias_at(last_s) * gap_s, 1.0 + 0.02 * gap_s
         self._graph.add_vehicle(
             chain, time_s, start_m, expected_m + moved_m, start_sigma_m=1e4, like=before

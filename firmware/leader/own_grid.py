@@ -4,6 +4,8 @@ import numpy as np
 
 from firmware.submaps import BinnedSoundings, GriddedSubmap
 
+_LEAST_SHARE = 0.25  # of a bin: a cell that is touched by less lies beside the soundings
+
 
 def grid_of(bins: BinnedSoundings, cell_m: float) -> GriddedSubmap:
     """Return binned soundings averaged into cells of a regular grid.
@@ -31,6 +33,7 @@ def grid_of(bins: BinnedSoundings, cell_m: float) -> GriddedSubmap:
         depth_m = np.bincount(index, weight * np.tile(bins.depth_m, len(places)), size) / total
         time_s = np.bincount(index, weight * np.tile(bins.time_s, len(places)), size) / total
         variance_m2 = np.where(total > 0, 1.0 / total, np.nan)
+    depth_m[np.bincount(index, shares, size) < _LEAST_SHARE] = np.nan
     return GriddedSubmap(
         north0_m=float(north0 * cell_m),
         east0_m=float(east0 * cell_m),

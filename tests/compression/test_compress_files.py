@@ -84,7 +84,7 @@ UNCERTAIN = {
     "millimetres across": {"paper", "dense", "lattice"},
     "cliff of 40 m": {"paper", "dense"},
 }
-NO_CELL = "give no cell: (no depth has a variance up to .* m2, the least is|the soundings enclose)"
+NO_CELL = "give no cell: (no depth is known to .* m2 beyond|the soundings enclose)"
 
 
 def bad_inputs() -> dict[str, Array]:

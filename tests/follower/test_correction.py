@@ -232,3 +232,18 @@ def test_answer_that_is_no_position_is_dropped(bad: float) -> None:
     correction = taught()
     assert not correction.receive_answer(640.0, np.zeros(2), np.array([bad, 0.0]))
     assert np.isfinite(correction.corrected(700.0, np.zeros(2))[0]).all()
+
+
+def test_a_range_heard_while_navigation_is_lost_is_held_against_the_doubt_so_far() -> None:
+    correction = taught(400.0)
+    lost_m = np.array([60.0, 0.0])  # how far the vehicle goes unseen by the middle of the loss
+    for quarter in range(4 * 400, 4 * 500):
+        correction.lose(quarter / 4.0, (quarter + 1) / 4.0)
+        if quarter == 4 * 450:
+            leader_m = np.array([600.0, 0.0])
+            range_m = float(np.hypot(*(leader_m - lost_m)))
+            correction.receive_range(450.0, drift_m(400.0), leader_m, 1.0, range_m, 0.0)
+    state = correction._seen[-1].state
+    mean, covariance = state.blended()
+    assert np.abs(mean[2:4] - BIAS_MPS).max() < 3.0 * np.sqrt(covariance[2, 2])
+    assert covariance[0, 0] > 250.0**2 * 0.5

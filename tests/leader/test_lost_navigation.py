@@ -119,3 +119,48 @@ def test_a_sub_map_is_not_joined_over_lost_navigation() -> None:
     spans = [(s.track.time_s[0], s.track.time_s[-1]) for s in leader.atlas]
     assert all(end <= 206.0 or begin >= 259.0 for begin, end in spans)
     assert any(begin >= 259.0 for begin, _ in spans)
+
+
+def test_one_loss_is_one_boot_whatever_stamps_come_in_it() -> None:
+    follower = follower_of(corner)
+    for quarter in range(1, 4 * 280 + 1):
+        now_s = quarter / 4.0
+        steer(follower, now_s, "without bottom")
+        if LOST_S[0] < now_s < LOST_S[1] and now_s % 5.0 == 0.0:
+            for bad_s in (np.nan, 100.0):
+                follower.receive_odometry(
+                    Odometry(
+                        time_s=bad_s,
+                        velocity_north_mps=2.0,
+                        velocity_east_mps=0.0,
+                        yaw_rad=0.0,
+                        depth_m=10.0,
+                    )
+                )
+    assert follower.status()["navigation_lost"] == 1
+
+
+def test_a_short_loss_costs_no_more_doubt_than_it_is_long() -> None:
+    """What was measured before it is sent by itself: the leader's gap is the loss, no more."""
+    path = line(0.0, 60.0)
+    leader, follower = leader_of(line(0.0, 0.0)), follower_of(path)
+    crew = Convoy(leader=leader, leader_path=line(0.0, 0.0), followers={})
+    for quarter in range(1, 4 * 200 + 1):
+        now_s = quarter / 4.0
+        crew.run(now_s - 0.25, now_s)
+        if not 110.0 <= now_s < 117.0:
+            sail(follower, path, now_s)
+        follower.tick(now_s)
+        frame = follower.poll(now_s)
+        if frame is not None:
+            leader.receive_frame(frame, None, now_s + 1.0)
+    before, after = sorted(leader.graph.vehicles())[1:]
+    gap_s = leader.fleet.track(after).time_s[0] - leader.fleet.track(before).time_s[-1]
+    assert 5.0 < gap_s < 12.0
+
+
+def test_spans_told_by_a_clock_that_was_set_back_are_all_doubted() -> None:
+    graph = leader_of(corner).graph
+    for begin_s, end_s in ((100.0, 150.0), (50.0, 55.0), (55.0, 60.0)):
+        graph.lose(0, begin_s, end_s)
+    assert graph._chains[0].lost == [(100.0, 150.0), (50.0, 60.0)]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from firmware.geometry import Array
 from firmware.leader.ambiguity import Prior, ridge_of
 from firmware.leader.atlas import SheetId, sheet_of
 from firmware.leader.drifts import AGE_S
@@ -107,6 +108,18 @@ def test_what_strain_may_have_done_is_no_evidence() -> None:
     assert _hints(scenes, prior_m=20.0, strain_sigma_m=30.0) == 0
 
 
+def _ridge(off_m: Array) -> ErrorSurface:
+    """Return a surface that fits best where shifts are not off (K, L) a line."""
+    return ErrorSurface(
+        north_m=CROSS_M,
+        east_m=CROSS_M,
+        overlap_cells=np.full(off_m.shape, 500.0),
+        residual_m2=0.01 * (0.5 + off_m**2 / 4.0),
+        noise_m2=np.full(off_m.shape, 0.01),
+        depth_offset_m=np.zeros(off_m.shape),
+    )
+
+
 @pytest.mark.parametrize("turned_rad", [0.0, 0.5])
 @pytest.mark.parametrize(("bend_per_m", "strays"), [(0.0, False), (0.01, True)])
 def test_one_axis_closure_knows_how_its_contour_bends(
@@ -116,14 +129,7 @@ def test_one_axis_closure_knows_how_its_contour_bends(
     across_m = axis[0] * CROSS_M[:, None] + axis[1] * CROSS_M[None, :]
     along_m = axis[0] * CROSS_M[None, :] - axis[1] * CROSS_M[:, None]
     off_m = across_m - bend_per_m * along_m**2
-    surface = ErrorSurface(
-        north_m=CROSS_M,
-        east_m=CROSS_M,
-        overlap_cells=np.full(off_m.shape, 500.0),
-        residual_m2=0.01 * (0.5 + off_m**2 / 4.0),
-        noise_m2=np.full(off_m.shape, 0.01),
-        depth_offset_m=np.zeros(off_m.shape),
-    )
+    surface = _ridge(off_m)
     prior = Prior(np.array([0.0, 10.0]), 225.0 * np.eye(2))
     found_m2 = ridge_of(surface, 1.0, prior, np.zeros(2), axis).strayed_m2
     assert (found_m2 > 4.0) is strays
@@ -134,14 +140,7 @@ def test_one_axis_closure_has_the_axis_of_the_whole_ridge_not_of_what_the_prior_
     """A few degrees beside it, it would be metres off where the prior is wrong by three sigmas."""
     right, about = (np.array([np.cos(at), np.sin(at)]) for at in (1.07, 1.17))
     off_m = right[0] * CROSS_M[:, None] + right[1] * CROSS_M[None, :]
-    surface = ErrorSurface(
-        north_m=CROSS_M,
-        east_m=CROSS_M,
-        overlap_cells=np.full(off_m.shape, 500.0),
-        residual_m2=0.01 * (0.5 + off_m**2 / 4.0),
-        noise_m2=np.full(off_m.shape, 0.01),
-        depth_offset_m=np.zeros(off_m.shape),
-    )
+    surface = _ridge(off_m)
     found = ridge_of(surface, 1.0, Prior(np.zeros(2), 100.0 * np.eye(2)), np.zeros(2), about)
     assert np.degrees(np.arccos(found.axis @ right)) < 1.0
     assert np.degrees(found.sigma_rad) < 3.0

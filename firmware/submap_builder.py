@@ -67,9 +67,9 @@ class SubmapBuilder:
     def receive_ping(self, ping: Ping, state: ReckonedState) -> None:
         """Add a ping measured at a dead-reckoned state; bad beams and pings are counted.
 
-        A ping without a state of its time has no place.
+        A ping without a state of its time and of this sub-map has no place.
         """
-        if not abs(ping.time_s - state.time_s) <= _OLDEST_STATE_S:
+        if not self._states or not abs(ping.time_s - state.time_s) <= _OLDEST_STATE_S:
             self.bad_pings += 1
             return
         soundings_ned_m, bad = soundings_from_ping(ping, state.north_m, state.east_m, self._sonar)
@@ -80,7 +80,7 @@ class SubmapBuilder:
         self._bins.add(soundings_ned_m, ping.time_s)
 
     def tear(self, state: ReckonedState) -> None:
-        """End the sub-map here: nobody knows how it lies to what follows."""
+        """End the sub-map: nobody knows how it lies to what follows the next state received."""
         if self._states:
             self._close(state)
         self._window = self._window_of(state)
@@ -93,12 +93,11 @@ class SubmapBuilder:
     def _close(self, next_state: ReckonedState) -> None:
         if self._finished is not None:
             self.submaps_overwritten += 1
-        states = [*self._states, next_state] if self._states else [next_state]
         self._finished = Submap(
             vehicle=self._vehicle,
             boot_epoch=self.boot_epoch,
             index=self._index,
-            track=track_of(self._states or states),
+            track=track_of(self._states or [next_state]),
             bins=self._bins.result(),
         )
         self._index = (self._index + 1) % _SUBMAP_NUMBERS

@@ -105,7 +105,8 @@ class LeaderCore:
         state = self._reckoning.receive_odometry(odometry)
         if self._reckoning.lost_s > 0.0:
             self._lose(state)
-        self._builder.receive_state(state)
+        else:
+            self._builder.receive_state(state)
         if odometry.fix is not None:
             self._fixes.hold(odometry.time_s, odometry.fix)
         track = self.fleet.own

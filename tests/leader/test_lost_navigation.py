@@ -6,8 +6,8 @@ import pytest
 from firmware.belief import Belief
 from firmware.follower.core import FollowerCore
 from firmware.leader.core import LeaderCore
-from firmware.soundings import Fix, Odometry
-from tests.leader.vessels import Convoy, follower_of, leader_of, line, sail
+from firmware.soundings import Fix, Odometry, Ping
+from tests.leader.vessels import ANGLES_RAD, Convoy, follower_of, leader_of, line, sail
 
 LOST_S = (200.0, 260.0)
 
@@ -34,6 +34,19 @@ def steer(core: FollowerCore | LeaderCore, time_s: float, how: str, fix: Fix | N
             depth_m=10.0,
             fix=fix,
         )
+    )
+
+
+def ping_at(time_s: float) -> Ping:
+    """Return a ping of a level seabed 40 m below."""
+    return Ping(
+        time_s=time_s,
+        slant_ranges_m=40.0 / np.cos(ANGLES_RAD),
+        beam_angles_rad=ANGLES_RAD,
+        roll_rad=0.0,
+        pitch_rad=0.0,
+        yaw_rad=0.0,
+        depth_m=10.0,
     )
 
 
@@ -106,19 +119,24 @@ def test_a_follower_doubts_where_it_is_and_the_leader_does_too(how: str) -> None
     assert chi_square(believed) < 6.0
 
 
-def test_a_sub_map_is_not_joined_over_lost_navigation() -> None:
+def test_nothing_that_is_seen_while_navigation_is_lost_is_mapped() -> None:
+    """The sonar goes on, but nobody knows where it looks; what was seen before stands by itself."""
     follower, leader = follower_of(corner), leader_of(corner)
     for core in (follower, leader):
         for quarter in range(1, 4 * 300 + 1):
             now_s = quarter / 4.0
             if LOST_S[0] <= now_s < LOST_S[1]:
                 steer(core, now_s, "without bottom")
+                core.receive_ping(ping_at(now_s))
             else:
                 sail(core, corner, now_s)
             core.tick(now_s)
-    spans = [(s.track.time_s[0], s.track.time_s[-1]) for s in leader.atlas]
-    assert all(end <= 206.0 or begin >= 259.0 for begin, end in spans)
-    assert any(begin >= 259.0 for begin, _ in spans)
+    times_s = [sheet.grid.time_s[np.isfinite(sheet.grid.depth_m)] for sheet in leader.atlas]
+    assert all(seen_s.max() <= 206.0 or seen_s.min() >= 259.0 for seen_s in times_s)
+    assert any(200.0 <= seen_s.max() <= 206.0 for seen_s in times_s)
+    assert any(seen_s.min() >= 259.0 for seen_s in times_s)
+    for core in (follower, leader):
+        assert core.status()["bad_pings"] == 4 * 55
 
 
 def test_one_loss_is_one_boot_whatever_stamps_come_in_it() -> None:

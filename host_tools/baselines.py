@@ -33,7 +33,6 @@ class Originals:
     """The followers' sub-maps as measured, by vehicle, boot epoch and number."""
 
     submaps: dict[Key, Submap]
-    unlike_any: int = 0
 
     def of(self, transfer: SubmapTransfer) -> Submap:
         """Return the sub-map that a transfer carries.
@@ -45,7 +44,6 @@ class Originals:
         """
         key = (transfer.vehicle, transfer.boot_epoch, transfer.submap)
         if key not in self.submaps:
-            self.unlike_any += 1
             raise EstimationError(f"sub-map {key} was never measured")
         return self.submaps[key]
 

@@ -3,25 +3,13 @@
 import numpy as np
 from scipy import ndimage
 
-from firmware.submaps import BinnedSoundings, GriddedSubmap
+from firmware.submaps import GriddedSubmap
 from host_tools.results import SoundingPatch
 from host_tools.simulator.placement import Window
 
 # Beyond this variance a reconstructed cell says nothing (paper, 4.2).
 WORST_VARIANCE_M2 = 0.1
 FINEST_SPLIT = 8
-
-
-def patch_of_bins(vehicle: int, bins: BinnedSoundings) -> SoundingPatch:
-    """Return the patch of a vehicle's own binned soundings."""
-    return SoundingPatch(
-        vehicle=vehicle,
-        north_m=bins.north_m,
-        east_m=bins.east_m,
-        depth_m=bins.depth_m,
-        variance_m2=bins.variance_m2,
-        time_s=bins.time_s,
-    )
 
 
 def patch_of_grid(vehicle: int, grid: GriddedSubmap, window: Window) -> SoundingPatch:

@@ -131,11 +131,6 @@ class Atlas:
     def __getitem__(self, sheet_id: SheetId) -> Sheet:
         return self._sheets[sheet_id]
 
-    @property
-    def shelved(self) -> int:
-        """How many sheets are on the shelf."""
-        return len(self._shelved)
-
     def add(self, sheet: Sheet) -> None:
         """Keep a sheet; a better version of a known one takes its place."""
         if sheet.id in self._shelved:

@@ -29,8 +29,8 @@ class Raster:
     """A north-up grid of elevations in a projected system in metres; row 0 is the northernmost.
 
     `read` may be asked for any window; `coarse_m` (R, C) is the whole grid thinned for planning,
-    NaN where there is no data, and `coarse_step` says by how many cells. remarks say what was
-    taken for no data though the file does not call it so.
+    NaN where there is no data. remarks say what was taken for no data though the file does not
+    call it so.
     """
 
     name: str
@@ -40,7 +40,6 @@ class Raster:
     rows: int
     columns: int
     coarse_m: NDArray[np.float32]
-    coarse_step: int
     positive_down: bool
     relief_m: NDArray[np.float32] | None = None
     remarks: tuple[str, ...] = ()
@@ -104,7 +103,6 @@ def open_terrain(path: Path | None, relief_seed: int = 1) -> Raster:
                 rows=dataset.height,
                 columns=dataset.width,
                 coarse_m=elevation_m,
-                coarse_step=step,
                 positive_down=positive_down,
                 remarks=_remarks(path.name, stored, known),
             )
@@ -173,7 +171,6 @@ def _built_in(seed: int) -> Raster:
         rows=size,
         columns=size,
         coarse_m=elevation_m,
-        coarse_step=1,
         positive_down=False,
         relief_m=elevation_m,
     )

@@ -106,10 +106,6 @@ class ModemClock:
             return encode("CCTMS", moment.strftime("%Y-%m-%dT%H:%M:%SZ"), 0)
         return encode("CCCLK", *moment.strftime("%Y,%m,%d,%H,%M,%S").split(","))
 
-    def query_line(self) -> bytes | None:
-        """Return the line that asks for the time; the old dialect has none."""
-        return encode("CCTMQ", 0) if self.speaks_new else None
-
     def told_right(self, sentence: Sentence, asked_s: float) -> bool | None:
         """Return whether a CATMQ line names the second it was asked in; None when it names none.
 

@@ -62,10 +62,6 @@ class SerialPort:
         if self._unsent:
             self._guarded(self._write, now_s)
 
-    def write_some(self, now_s: float) -> None:
-        """Go on with what the port did not take before."""
-        self.write(b"", now_s)
-
     def close(self) -> None:
         """Give the port back for good."""
         if self._serial is not None:

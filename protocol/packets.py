@@ -192,13 +192,6 @@ class SubmapPacket(_BitwiseEqual):
         plausible = (depth_m >= HIGHEST_M) & (depth_m <= DEEPEST_M)
         return np.asarray(np.isfinite(points).all(axis=1) & near & plausible)
 
-    @property
-    def has_usable_hyperparameters(self) -> bool:
-        """Whether all four are finite, b and c not zero, and the mean depth plausible."""
-        b, c, _, mean_depth_m = (float(value) for value in self.hyperparameters)
-        finite = bool(np.isfinite(self.hyperparameters).all())
-        return finite and b != 0.0 and c != 0.0 and HIGHEST_M <= mean_depth_m <= DEEPEST_M
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SubmapFragment:

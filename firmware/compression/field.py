@@ -44,7 +44,6 @@ class Field:
     frame: LatticeFrame
     trend: "Trend"
     coefficients_m: Array
-    spectrum_m2: Array
     noise_m2: float  # of the mean of a cell, typical
     unknown_m2: float  # of the depth at a node, that the cells leave
 
@@ -121,7 +120,6 @@ def fitted_field_steps(
         frame=frame,
         trend=trend,
         coefficients_m=coefficients.astype(np.float64),
-        spectrum_m2=prior,
         noise_m2=float(np.median(variance_m2)),
         unknown_m2=float(unknown.mean()),
     )

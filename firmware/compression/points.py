@@ -187,7 +187,6 @@ def report_of(fitted: FittedPoints) -> FitReport:
         evaluations=fitted.evaluations,
         failed_factorisations=fitted.failed_factorisations,
         ended="running",
-        expected_rmse_m=float(np.sqrt(max(fitted.error_m2, 0.0))),
     )
 
 

@@ -21,7 +21,6 @@ class FitReport:
     evaluations: int = 0
     failed_factorisations: int = 0
     ended: str = "not fitted"
-    expected_rmse_m: float = float("nan")
 
     @property
     def settled(self) -> bool:

@@ -86,7 +86,6 @@ class Calibration:
         self._information = np.zeros((2, 2))
         self._vector = np.zeros(2)
         self._time_s: float | None = None
-        self.overlaps_used = 0
 
     @property
     def errors(self) -> Array:
@@ -111,7 +110,6 @@ class Calibration:
         self._time_s = now_s
         self._information = self._information + found.information
         self._vector = self._vector + found.vector
-        self.overlaps_used += 1
         return True
 
 

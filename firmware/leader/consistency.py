@@ -53,12 +53,11 @@ class Consistency:
     """The verdict on each closure, in the order given.
 
     believed (K,) is membership of the largest consistent set; partners (K,) the number of others
-    in that set whose loop with it could be tested and closes; tested (K,) how many could be tested.
+    in that set whose loop with it could be tested and closes.
     """
 
     believed: NDArray[np.bool_]
     partners: NDArray[np.int64]
-    tested: NDArray[np.int64]
 
 
 def consistent_set(
@@ -72,7 +71,7 @@ def consistent_set(
     """
     count = len(closures)
     believed = np.zeros(count, dtype=bool)
-    partners, tested = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
+    partners = np.zeros(count, dtype=np.int64)
     step = max(settings.window // 2, 1)
     for start in range(0, max(count - step, 1), step):
         window = np.arange(start, min(start + settings.window, count))
@@ -83,12 +82,9 @@ def consistent_set(
         chosen = np.zeros(window.size, dtype=bool)
         chosen[members] = True
         support = (agree & known)[:, chosen].sum(axis=1)
-        trials = known[:, chosen].sum(axis=1)
-        better = support > partners[window]
-        partners[window] = np.where(better, support, partners[window])
-        tested[window] = np.maximum(tested[window], trials)
+        partners[window] = np.maximum(partners[window], support)
         believed[window] |= chosen
-    return Consistency(believed=believed, partners=partners, tested=tested)
+    return Consistency(believed=believed, partners=partners)
 
 
 def agreement(

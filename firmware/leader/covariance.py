@@ -24,7 +24,6 @@ class Refined:
     shift_m: Array
     covariance_m2: Array
     walk_m2: float
-    depth_offset_m: float
     variance_m2: float
     misfit: float
     overlap_cells: int
@@ -47,7 +46,6 @@ def measure(field: Aligned, noise: NoiseModel) -> Refined:
         shift_m=field.shift_m,
         covariance_m2=covariance,
         walk_m2=noise.walk_m2_per_s * walk_s,
-        depth_offset_m=float(unknowns[2]) if noise.offset_sigma_m > 0.0 else 0.0,
         variance_m2=float(np.sum(field.variance_m2 * field.both) / cells),
         misfit=misfit,
         overlap_cells=int(cells),

@@ -65,13 +65,11 @@ class VoteWindow:
 class Vote:
     """Sum of the windows' log ratios: above zero the map agrees, below it contradicts.
 
-    ratios holds one value per window in the order given, zero for those that abstain; informed
-    counts the others.
+    informed counts the windows that did not abstain.
     """
 
     log_ratio: float
     informed: int
-    ratios: tuple[float, ...]
 
 
 def vote(
@@ -85,12 +83,8 @@ def vote(
     (`Match.residual / Match.variance_m2`): its neighbours should fit about as well.
     """
     tolerated = settings.tolerance * float(np.clip(matched_misfit, *_MISFIT_RANGE))
-    ratios = tuple(_ratio(window, settings, tolerated) for window in windows)
-    return Vote(
-        log_ratio=float(sum(ratios)),
-        informed=sum(ratio != 0.0 for ratio in ratios),
-        ratios=ratios,
-    )
+    ratios = [_ratio(window, settings, tolerated) for window in windows]
+    return Vote(log_ratio=float(sum(ratios)), informed=sum(ratio != 0.0 for ratio in ratios))
 
 
 def carried(

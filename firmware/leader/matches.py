@@ -136,7 +136,6 @@ class Match:
     covariance_m2: Array
     residual: float
     overlap_cells: int
-    depth_offset_m: float
     axis_deg: float | None
     false_mass: float
     log_evidence: float

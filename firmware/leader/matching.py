@@ -270,7 +270,6 @@ def _closure(
         covariance_m2=covariance_m2,
         residual=residual,
         overlap_cells=refined.overlap_cells,
-        depth_offset_m=refined.depth_offset_m,
         axis_deg=axis_deg,
         false_mass=false_mass,
         log_evidence=log_evidence,

@@ -45,4 +45,4 @@ def test_few_soundings_leave_much_unknown() -> None:
 def test_frequencies_without_signal_are_given_up() -> None:
     field = estimated(made_survey(noise_m=0.2, beams=192).soundings_ned_m)
     fine = wavenumbers(field.frame) > 0.25  # cycles per m; the relief's finest is 0.04
-    assert field.spectrum_m2[fine].max() < 0.1 * field.noise_m2
+    assert (field.coefficients_m[fine] ** 2).max() < 0.1 * field.noise_m2

@@ -182,7 +182,6 @@ def test_outcomes_read_back_exactly() -> None:
         covariance_m2=np.array([[0.1, 0.01], [0.01, np.float64(0.3)]]),
         residual=0.1,
         overlap_cells=int(np.int64(7)),
-        depth_offset_m=float(np.float32(0.1)),
         axis_deg=None,
         false_mass=0.0,
         log_evidence=np.inf,

@@ -201,7 +201,6 @@ def test_closure_is_told_where_the_sonar_really_looked(graph: PoseGraph) -> None
         covariance_m2=np.eye(2),
         residual=0.01,
         overlap_cells=100,
-        depth_offset_m=0.0,
         axis_deg=None,
         false_mass=0.0,
         log_evidence=9.0,

@@ -86,7 +86,7 @@ def test_pairs_without_odometry_between_them_do_not_contradict() -> None:
     assert agree.sum() == 90
     result = consistent_set(closures, nothing, SETTINGS)
     assert result.believed.all()
-    assert not result.tested.any()
+    assert not result.partners.any()
 
 
 def test_none_and_one_closure_are_consistent() -> None:

@@ -58,7 +58,6 @@ def test_depth_offset_is_a_nuisance_unless_switched_off(scene: Scene) -> None:
     reference = scene.submap(200, 200, (41, 70))
     query = scene.submap(200, 220, (41, 70), offset_m=0.4)
     found = matched(reference, query, np.zeros(2), 10.0)
-    assert found.depth_offset_m == pytest.approx(-0.4, abs=0.02)
     assert np.abs(found.shift_m).max() < 0.4
     absolute = dataclasses.replace(STILL, depth_offset_sigma_m=0.0, tilt_sigma=0.0)
     absolute = dataclasses.replace(absolute, bend_sigma_per_m=0.0)

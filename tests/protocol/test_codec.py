@@ -191,19 +191,15 @@ def test_what_a_profile_cannot_hold_is_a_local_error() -> None:
         restamp(encode(replace(sealed, body=bytes(10))), 3)
 
 
-def test_unused_and_absurd_values_are_told_from_usable_ones() -> None:
+def test_unused_and_absurd_points_are_told_from_usable_ones() -> None:
     packet = paper_packet()
     points = packet.points_ned_m.copy()
     points[0] = np.nan
     points[1, 2] = np.inf
     points[2, 0] = 2.0e6
     points[3, 2] = 20_000.0
-    packet = replace(packet, points_ned_m=points, hyperparameters=np.ones(4, np.float32))
+    packet = replace(packet, points_ned_m=points)
     assert packet.usable_points.tolist() == [False] * 4 + [True] * 11
-    assert packet.has_usable_hyperparameters
-    for bad in ([0, 1, 1, 1], [1, 0, 1, 1], [1, 1, np.nan, 1], [1, 1, 1, 1e9]):
-        unusable = replace(packet, hyperparameters=np.array(bad, np.float32))
-        assert not unusable.has_usable_hyperparameters
 
 
 def test_packets_compare_by_bits_and_hash_alike() -> None:

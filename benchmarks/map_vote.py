@@ -25,7 +25,7 @@ def line(
 ) -> list[GriddedSubmap]:
     """Return three sub-maps along a line."""
     step = np.array([np.cos(heading_rad), np.sin(heading_rad)]) * SPEED_MPS * DURATION_S
-    return [survey(seabed, middle + n * step, heading_rad, rng, 0.02) for n in NEIGHBOURS]
+    return [survey(seabed, middle + n * step, heading_rad, rng, 0.02)[0] for n in NEIGHBOURS]
 
 
 def windows(

@@ -34,9 +34,8 @@ class NoiseModel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Span:
-    """When one side of the overlap was measured; age_s (R, C) counts from origin_s."""
+    """When one side of the overlap was measured; age_s (R, C) counts from the mean time."""
 
-    origin_s: float
     mean_s: float
     length_s: float
     age_s: Array
@@ -81,7 +80,6 @@ def align(
     query: Layer,
     fields: tuple[Array, Array],
     shift_m: Array,
-    times_s: tuple[float | None, float | None],
     noise: NoiseModel,
 ) -> Aligned | None:
     """Return the fields of the overlap at a shift, None when too few cells overlap."""
@@ -97,10 +95,6 @@ def align(
     variance = under[_VARIANCE] + over[_VARIANCE] + noise.cell_sigma_m**2
     variance += 0.25 * noise.position_sigma_m**2 * np.sum((slope_r + slope_q) ** 2, axis=0)
     clean = both.astype(np.float64)
-    ages = [
-        _age(values[_TIME], clean, time_s)
-        for values, time_s in zip((under, over), times_s, strict=True)
-    ]
     return Aligned(
         shift_m=shift_m,
         cell_m=query.grid.cell_m,
@@ -112,7 +106,7 @@ def align(
         slope_r=slope_r,
         slope_q=slope_q,
         basis=_polynomials(clean, query.grid.cell_m),
-        spans=(ages[0], ages[1]),
+        spans=(_span(under[_TIME], clean), _span(over[_TIME], clean)),
     )
 
 
@@ -125,16 +119,15 @@ def _centre(both: Array, query: Layer, at: Landing) -> Array:
     return np.asarray(origin_m + query.grid.cell_m * np.array([row, column]))
 
 
-def _age(time_s: Array, both: Array, origin_s: float | None) -> Span:
-    """Return the time of measurement since the origin (default: the overlap's mean time)."""
+def _span(time_s: Array, both: Array) -> Span:
+    """Return when the overlap's cells were measured, of times that are zero outside."""
     cells = both.sum()
     mean_s = float(np.sum(time_s) / cells)
     inside = time_s[both > 0.0]
     return Span(
-        origin_s=mean_s if origin_s is None else origin_s,
         mean_s=mean_s,
         length_s=float(inside.max() - inside.min()),
-        age_s=both * (time_s - (mean_s if origin_s is None else origin_s)),
+        age_s=both * (time_s - mean_s),
     )
 
 

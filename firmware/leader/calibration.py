@@ -133,7 +133,7 @@ def _evidence_of(
     shift = np.array(overlap.shift_m, dtype=np.float64)
     system = None
     for _ in range(_ITERATIONS):
-        field = align(reference, query, fields, shift, (None, None), noise)
+        field = align(reference, query, fields, shift, noise)
         at = land(reference.grid, query.grid, shift)
         if field is None or at is None or field.both.sum() < settings.minimum_cells:
             return None

@@ -15,10 +15,10 @@ class Refined:
     """The optimum near one candidate.
 
     covariance_m2 (2, 2) is of the shift, a kilometre along a direction without any information;
-    walk_m2 is to be added to each axis for the random walk of dead reckoning between the
-    overlap and the two reference times. variance_m2 is the predicted mean variance of a
-    cell's difference; misfit the mean of squared normalised residuals (1 when the model holds).
-    centre_m (2,) is the overlap's middle on the reference.
+    walk_m2 is to be added to each axis for the random walk of dead reckoning while the overlap was
+    measured. variance_m2 is the predicted mean variance of a cell's difference; misfit the mean of
+    squared normalised residuals (1 when the model holds). centre_m (2,) is the overlap's middle on
+    the reference.
     """
 
     shift_m: Array
@@ -41,7 +41,7 @@ def measure(field: Aligned, noise: NoiseModel) -> Refined:
     misfit = float(np.sum(field.weight * residual**2) / cells)
     score = _score_covariance(field, columns, residual, max(misfit, 1.0), noise)
     covariance = _sandwich(field, columns, prior, score)
-    walk_s = sum(abs(s.mean_s - s.origin_s) + s.length_s / 12.0 for s in field.spans)
+    walk_s = sum(span.length_s / 12.0 for span in field.spans)
     return Refined(
         shift_m=field.shift_m,
         covariance_m2=covariance,
@@ -50,8 +50,8 @@ def measure(field: Aligned, noise: NoiseModel) -> Refined:
         misfit=misfit,
         overlap_cells=int(cells),
         centre_m=field.centre_m,
-        reference_time_s=field.spans[0].origin_s,
-        query_time_s=field.spans[1].origin_s,
+        reference_time_s=field.spans[0].mean_s,
+        query_time_s=field.spans[1].mean_s,
     )
 
 

@@ -124,12 +124,12 @@ class NoMatch(enum.Enum):
 class Match:
     """A shift to add to the query's NED coordinates so that it lies on the reference.
 
-    The shift holds between the reference's instant and the query's; by default these are the
-    mean times at which the overlap was measured. covariance_m2 (2, 2) is the measurement's own,
-    without the prior. axis_deg is None, or the direction from north in which a one-axis closure
-    holds; across it the covariance is wide. false_mass is the posterior probability that the true
-    shift lies outside the winner's basin (outside its line, for one axis). centre_m (2,) is the
-    overlap's middle in the reference's coordinates.
+    The shift holds between reference_time_s and query_time_s, the mean times at which the two
+    measured the overlap. covariance_m2 (2, 2) is the measurement's own, without the prior. axis_deg
+    is None, or the direction from north in which a one-axis closure holds; across it the covariance
+    is wide. false_mass is the posterior probability that the true shift lies outside the winner's
+    basin (outside its line, for one axis). centre_m (2,) is the overlap's middle in the reference's
+    coordinates.
     """
 
     shift_m: Array

@@ -45,7 +45,6 @@ def match(
     *,
     reference_reconstructed: bool = False,
     query_reconstructed: bool = False,
-    times_s: tuple[float | None, float | None] = (None, None),
     drifts: Drifts = NO_DRIFT,
     hinted: bool = True,
 ) -> MatchOutcome:
@@ -54,9 +53,8 @@ def match(
     E of Eq. (8) (Eq. (10) when a side is reconstructed) is screened at every lattice shift of the
     window that the prior implies, the best minima are refined below the cell, and the winner has
     to pass the threshold, carry evidence against unrelated seabed and leave little posterior mass
-    elsewhere. times_s are the instants of reference and query to which the shift shall refer. A
-    pair that fails leaves a hint, if one is asked for; then every shift is judged with the drifts
-    that it implies.
+    elsewhere. A pair that fails leaves a hint, if one is asked for; then every shift is judged with
+    the drifts that it implies.
 
     Raises
     ------
@@ -80,7 +78,7 @@ def match(
     relief = relief_of(problem, whole, _best(surface))
     if relief is None:
         return _none(NoMatch.FEATURELESS)
-    outcome = _search(problem, surface, relief, prior, times_s)
+    outcome = _search(problem, surface, relief, prior)
     if outcome.match is not None or not hinted:
         return outcome
     surface = screened_by_drift(problem, surface, (reference, query), drifts, prior)
@@ -92,12 +90,11 @@ def _search(
     surface: ErrorSurface,
     relief: ambiguity.Relief,
     prior: Prior,
-    times_s: tuple[float | None, float | None],
 ) -> MatchOutcome:
     """Return the outcome of a screened pair: evidence, refinement, gates."""
     null_share = problem.settings.null_share
     found = ambiguity.posterior(surface, _evidence(surface, relief), prior, null_share)
-    candidates = _refine_best(surface, found, prior, problem, times_s)
+    candidates = _refine_best(surface, found, prior, problem)
     if not candidates:
         return _none(NoMatch.UNSETTLED)
     fitting = min(candidates, key=lambda c: c.residual_m2 / c.noise_m2)
@@ -156,7 +153,6 @@ def _refine_best(
     found: ambiguity.Posterior,
     prior: Prior,
     problem: PairProblem,
-    times_s: tuple[float | None, float | None],
 ) -> list[_Candidate]:
     """Return the refined minima among the best lattice shifts."""
     fields = (
@@ -166,7 +162,7 @@ def _refine_best(
     inverse = np.linalg.inv(prior.covariance_m2)
     candidates = []
     for start_m in _starts(surface, found, problem.settings, problem.query.grid.cell_m):
-        field = refine(problem.reference, problem.query, fields, start_m, times_s, problem.noise)
+        field = refine(problem.reference, problem.query, fields, start_m, problem.noise)
         if field is None:
             continue
         error, count, _ = problem.error_at(field.shift_m, absolute=False)

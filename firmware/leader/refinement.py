@@ -16,17 +16,15 @@ def refine(
     query: Layer,
     fields: tuple[Array, Array],
     start_m: Array,
-    times_s: tuple[float | None, float | None],
     noise: NoiseModel,
 ) -> Aligned | None:
     """Return the overlap at the optimum near `start_m`, None where the fit leaves it or diverges.
 
-    times_s are the instants of the reference and the query to which the shift refers; None means
-    the mean time of the overlap, where the fit is best determined.
+    The shift refers to the mean times of the overlap, where the fit is best determined.
     """
     shift = np.array(start_m, dtype=np.float64)
     for _ in range(_ITERATIONS):
-        field = align(reference, query, fields, shift, times_s, noise)
+        field = align(reference, query, fields, shift, noise)
         if field is None:
             return None
         unknowns = solve(field, *design_of(field, noise))
@@ -39,7 +37,7 @@ def refine(
             break
     if np.hypot(*(shift - start_m)) > 4.0 * reference.grid.cell_m + _LONGEST_STEP_M:
         return None
-    return align(reference, query, fields, shift, times_s, noise)
+    return align(reference, query, fields, shift, noise)
 
 
 def solve(field: Aligned, columns: Array, prior: Array) -> Array:

@@ -6,6 +6,8 @@ import numpy as np
 
 from firmware.geometry import Array
 
+_WINDOW_S = 40.0  # over which drift is the slope of the correction: a sub-map
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trajectory:
@@ -39,15 +41,15 @@ class Trajectory:
             [np.interp(time_s, self.time_s[near], self.bias_mps[near, a]) for a in (0, 1)]
         )
 
-    def drift_at(self, time_s: float, window_s: float = 40.0) -> Array:
+    def drift_at(self, time_s: float) -> Array:
         """Return the velocity (2,) in m/s by which dead reckoning ran away around the time.
 
         It is the slope of the correction over a window, so that heading bias, log scale and what
         the smoothed random part tells are in it beside the bias.
         """
-        start_s = max(time_s - window_s / 2, float(self.time_s[0]))
-        end_s = min(time_s + window_s / 2, float(self.time_s[-1]))
-        if end_s - start_s < window_s / 4:
+        start_s = max(time_s - _WINDOW_S / 2, float(self.time_s[0]))
+        end_s = min(time_s + _WINDOW_S / 2, float(self.time_s[-1]))
+        if end_s - start_s < _WINDOW_S / 4:
             return np.asarray(self.bias_mps[-1] if time_s > self.time_s[0] else self.bias_mps[0])
         ends_s = np.array([start_s, end_s])
         at_m = self.correct(ends_s, np.zeros((2, 2)))

@@ -14,7 +14,8 @@ import numpy as np
 
 from benchmarks.matching import DURATION_S, SPEED_MPS, TERRAINS, Seabed, survey, synthetic, terrain
 from firmware.leader.map_vote import VoteSettings, VoteWindow, carried, vote
-from firmware.leader.matching import MatchingSettings, match
+from firmware.leader.matches import MatchingSettings
+from firmware.leader.matching import match
 from firmware.submaps import GriddedSubmap
 
 NEIGHBOURS = (-1, 0, 1)

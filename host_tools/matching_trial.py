@@ -16,7 +16,8 @@ from firmware.compression.binning import SoundingBins
 from firmware.compression.packing import submap_header
 from firmware.compression.settings import BinningSettings, CompressionSettings
 from firmware.geometry import Array
-from firmware.leader.matching import MatchingSettings, match
+from firmware.leader.matches import MatchingSettings
+from firmware.leader.matching import match
 from firmware.leader.own_grid import grid_of
 from firmware.leader.reconstruction import ReconstructionSettings, reconstruct_packets
 from firmware.submaps import BinnedSoundings, GriddedSubmap, Track

@@ -12,7 +12,7 @@ from firmware.leader.closure_settings import ClosureSettings
 from firmware.leader.displacement import displaced
 from firmware.leader.ledger import Anchor
 from firmware.leader.match_jobs import MatchJob
-from firmware.leader.matching import Hint, MatchOutcome
+from firmware.leader.matches import Hint, MatchOutcome
 from firmware.leader.offsets import anchor_of
 from firmware.leader.pose_graph import PoseGraph
 

@@ -25,7 +25,7 @@ from firmware.leader.consistency import (
     consistent_set,
 )
 from firmware.leader.map_vote import VoteSettings, VoteWindow, carried, vote
-from firmware.leader.matching import MatchingSettings
+from firmware.leader.matches import MatchingSettings
 from firmware.leader.nonconvexity import Doubt
 from firmware.leader.pairing import Calibrations, side_of
 from firmware.leader.pose_graph import PoseGraph

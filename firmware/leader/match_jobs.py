@@ -13,8 +13,8 @@ from firmware.leader.closure_settings import ClosureSettings
 from firmware.leader.displacement import Look
 from firmware.leader.drifts import NO_DRIFT, Drifts
 from firmware.leader.estimate import Estimate
-from firmware.leader.matches import NoMatch
-from firmware.leader.matching import MatchingSettings, MatchOutcome, match
+from firmware.leader.matches import MatchingSettings, MatchOutcome, NoMatch
+from firmware.leader.matching import match
 from firmware.leader.nonconvexity import Doubt
 from firmware.leader.offsets import Offset, correction_of, corrections, offsets_of
 from firmware.leader.pairing import Calibrations, Side, side_of, strain_m

@@ -11,7 +11,7 @@ from firmware.leader.ambiguity import Prior
 from firmware.leader.covariance import Refined, measure
 from firmware.leader.drifts import NO_DRIFT, Drifts, screened_by_drift
 from firmware.leader.hinting import hint_of
-from firmware.leader.matches import Hint, Match, MatchingSettings, MatchOutcome, NoMatch
+from firmware.leader.matches import Match, MatchingSettings, MatchOutcome, NoMatch
 from firmware.leader.pair_problem import PairProblem, pair_problem, relief_of
 from firmware.leader.refinement import refine
 from firmware.leader.screening import ErrorSurface
@@ -21,8 +21,6 @@ from protocol.errors import EstimationError
 _FREE_M = 1e4  # of a one-axis closure across it: nothing, however often it is said
 _DOUBTED = 3.0  # sigmas of the prior by which a one-axis closure may have to slide
 _NEGLIGIBLE = 1e-6  # mass beside the best lattice shift's that is not worth refining
-
-__all__ = ["Hint", "Match", "MatchOutcome", "MatchingSettings", "NoMatch", "match"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -14,7 +14,7 @@ from firmware.leader.closure_settings import ClosureSettings
 from firmware.leader.closures import enter_hint
 from firmware.leader.judgement import Judgement
 from firmware.leader.match_jobs import MatchJob, jobs_again
-from firmware.leader.matching import MatchOutcome, NoMatch
+from firmware.leader.matches import MatchOutcome, NoMatch
 from firmware.leader.pairing import Calibrations
 from firmware.leader.pose_graph import PoseGraph
 from protocol.errors import EstimationError

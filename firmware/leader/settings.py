@@ -12,7 +12,7 @@ from firmware.leader.fleet import FleetSettings
 from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.judgement import JudgementSettings
 from firmware.leader.manoeuvre import ManoeuvreSettings
-from firmware.leader.matching import MatchingSettings
+from firmware.leader.matches import MatchingSettings
 from firmware.leader.ranges import RangeSettings
 from firmware.leader.reconstruction import ReconstructionSettings
 from firmware.soundings import SonarSettings

@@ -9,7 +9,7 @@ from firmware.geometry import Array
 from firmware.leader.atlas import SheetId
 from firmware.leader.closures import Closure, Stage
 from firmware.leader.judgement import Judgement, JudgementSettings
-from firmware.leader.matching import MatchingSettings
+from firmware.leader.matches import MatchingSettings
 from firmware.leader.pose_graph import PoseGraph
 from firmware.submaps import Track
 from tests.leader.test_pose_graph import close, started, walk

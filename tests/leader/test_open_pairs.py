@@ -13,7 +13,7 @@ from firmware.leader.displacement import Look
 from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.judgement import Judgement, JudgementSettings
 from firmware.leader.match_jobs import MatchJob, jobs_again
-from firmware.leader.matching import Hint, Match, MatchingSettings, MatchOutcome, NoMatch
+from firmware.leader.matches import Hint, Match, MatchingSettings, MatchOutcome, NoMatch
 from firmware.leader.offsets import offsets_of
 from firmware.leader.open_pairs import OpenPairs
 from firmware.leader.pairing import Calibrations

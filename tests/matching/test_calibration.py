@@ -5,7 +5,7 @@ import pytest
 
 from firmware.geometry import Array
 from firmware.leader.calibration import Calibration, CalibrationSettings, Overlap
-from firmware.leader.matching import MatchingSettings
+from firmware.leader.matches import MatchingSettings
 from firmware.leader.pair_problem import noise_model
 from firmware.leader.swath import levelled, swath_of
 from firmware.submaps import GriddedSubmap, Track

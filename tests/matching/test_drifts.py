@@ -8,7 +8,8 @@ import pytest
 from firmware.geometry import Array
 from firmware.leader.ambiguity import Prior
 from firmware.leader.drifts import NO_DRIFT, Drifts, screened_by_drift
-from firmware.leader.matching import MatchingSettings, match
+from firmware.leader.matches import MatchingSettings
+from firmware.leader.matching import match
 from firmware.leader.pair_problem import pair_problem
 from firmware.leader.screening import ErrorSurface
 from firmware.leader.warping import remove_drift

@@ -1,7 +1,8 @@
 import numpy as np
 
 from firmware.geometry import Array
-from firmware.leader.matching import Hint, MatchingSettings, match
+from firmware.leader.matches import Hint, MatchingSettings
+from firmware.leader.matching import match
 from tests.matching.scenes import Scene
 
 STILL = MatchingSettings(walk_m2_per_s=0.0, drift_sigma_mps=0.0, position_sigma_m=0.1)

@@ -5,7 +5,7 @@ import pytest
 
 from firmware.geometry import Array
 from firmware.leader.map_vote import VoteSettings, VoteWindow, carried, vote
-from firmware.leader.matching import MatchingSettings
+from firmware.leader.matches import MatchingSettings
 from tests.matching.scenes import Scene
 
 MATCHING, SETTINGS = MatchingSettings(), VoteSettings()

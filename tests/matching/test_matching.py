@@ -5,7 +5,8 @@ import pytest
 from scipy import ndimage
 
 from firmware.geometry import Array
-from firmware.leader.matching import Match, MatchingSettings, NoMatch, match
+from firmware.leader.matches import Match, MatchingSettings, NoMatch
+from firmware.leader.matching import match
 from firmware.submaps import GriddedSubmap
 from protocol.errors import EstimationError
 from tests.matching.scenes import Scene

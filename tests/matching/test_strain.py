@@ -10,7 +10,8 @@ from firmware.geometry import Array
 from firmware.leader.ambiguity import Prior, ridge_of
 from firmware.leader.atlas import SheetId, sheet_of
 from firmware.leader.drifts import AGE_S
-from firmware.leader.matching import MatchingSettings, match
+from firmware.leader.matches import MatchingSettings
+from firmware.leader.matching import match
 from firmware.leader.pair_problem import pair_problem
 from firmware.leader.pairing import Side, side_of, strain_m
 from firmware.leader.screening import ErrorSurface

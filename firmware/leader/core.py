@@ -91,8 +91,9 @@ class LeaderCore:
             self.counters,
         )
         self._closing = LoopClosing(self.graph, self.atlas, settings, self.counters)
-        noise_m2 = settings.matching.cell_sigma_m**2
-        self.outlook = Outlook(self.fleet, self.graph, self.atlas, settings.manoeuvre, noise_m2)
+        self.outlook = Outlook(
+            self.fleet, self.graph, self.atlas, settings.manoeuvre, settings.matching
+        )
         self.composed_s = start.time_s
         self._turns = Turns(slots, LEADER, start.time_s)
         start_m = np.array([start.north_m, start.east_m])

@@ -136,25 +136,22 @@ def expected_m(situation: Situation, velocities_mps: Array, settings: ManoeuvreS
 
 
 def relief_information(
-    depth_m: Array, cell_m: float, variance_m2: float, settings: ManoeuvreSettings
+    depth_m: Array, cell_m: float, variance_m2: float, redundancy: float, floor_m: float
 ) -> Array:
     """Return what a match on half of a grid (R, C) would tell of a shift, (2, 2) in 1/m^2.
 
-    Each cell tells along its slope; a few dozen cells err together, and no match is better than
-    the floor. A single row or column has no slopes.
+    Each cell tells along its slope; as many as the redundancy err together, and no match is better
+    than the floor. A single row or column has no slopes.
     """
     if min(depth_m.shape) < 2:
         return np.zeros((2, 2))
     north, east = np.gradient(depth_m, cell_m)
     slopes = np.stack([north.ravel(), east.ravel()])
     slopes = slopes[:, np.isfinite(slopes).all(axis=0)]
-    told = 0.5 * (slopes @ slopes.T) / (2.0 * variance_m2 * _ERR_TOGETHER)
+    told = 0.5 * (slopes @ slopes.T) / (2.0 * variance_m2 * redundancy)
     values, axes = np.linalg.eigh(told)
-    values = 1.0 / (1.0 / np.maximum(values, 1e-9) + settings.closure_floor_m**2)
+    values = 1.0 / (1.0 / np.maximum(values, 1e-9) + floor_m**2)
     return np.asarray((axes * values) @ axes.T)
-
-
-_ERR_TOGETHER = 30.0  # cells, as in the calibration
 
 
 def _dead_reckoning(vehicles: int, situation: Situation, step_s: float) -> tuple[Array, Array]:

@@ -16,6 +16,7 @@ from firmware.leader.manoeuvre import (
     propose,
     relief_information,
 )
+from firmware.leader.matches import MatchingSettings
 from firmware.leader.observability import Observability, observe
 from firmware.leader.offsets import anchor_of, corrections
 from firmware.submaps import GriddedSubmap
@@ -40,11 +41,11 @@ class Outlook:
         estimate: Estimate,
         atlas: Atlas,
         settings: ManoeuvreSettings,
-        noise_m2: float,
+        matching: MatchingSettings,
     ) -> None:
         self._noted: Observability | None = None
         self._fleet, self._estimate, self._atlas = fleet, estimate, atlas
-        self._settings, self._noise_m2 = settings, noise_m2
+        self._settings, self._matching = settings, matching
 
     def observe(self, now_s: float) -> Observability | None:
         """Return what the geometry leaves open of the vehicles' newest states; None if unknown."""
@@ -71,7 +72,7 @@ class Outlook:
         """Return the manoeuvre that would help most, if one would."""
         try:
             situation = situation_of(
-                self._fleet, self._estimate, self._atlas, self._settings, self._noise_m2
+                self._fleet, self._estimate, self._atlas, self._settings, self._matching
             )
             return propose(situation, self._settings)
         except (EstimationError, np.linalg.LinAlgError):
@@ -93,7 +94,11 @@ class Outlook:
 
 
 def situation_of(
-    fleet: Fleet, estimate: Estimate, atlas: Atlas, settings: ManoeuvreSettings, noise_m2: float
+    fleet: Fleet,
+    estimate: Estimate,
+    atlas: Atlas,
+    settings: ManoeuvreSettings,
+    matching: MatchingSettings,
 ) -> Situation:
     """Return where everyone is and what is known of the ground in reach.
 
@@ -113,7 +118,7 @@ def situation_of(
         ground=tuple(
             Ground(
                 position_m=place_m,
-                information=_told(sheet.grid, noise_m2, settings),
+                information=_told(sheet.grid, matching, settings.closure_floor_m),
             )
             for sheet, place_m in zip(sheets, places_m, strict=True)
         ),
@@ -122,9 +127,10 @@ def situation_of(
     )
 
 
-def _told(grid: GriddedSubmap, noise_m2: float, settings: ManoeuvreSettings) -> Array:
-    variance_m2 = float(np.nanmedian(grid.variance_m2)) + noise_m2
-    return relief_information(grid.depth_m, grid.cell_m, variance_m2, settings)
+def _told(grid: GriddedSubmap, matching: MatchingSettings, floor_m: float) -> Array:
+    variance_m2 = float(np.nanmedian(grid.variance_m2)) + matching.cell_sigma_m**2
+    redundancy = matching.calibration.redundancy
+    return relief_information(grid.depth_m, grid.cell_m, variance_m2, redundancy, floor_m)
 
 
 def _velocity(fleet: Fleet, estimate: Estimate, chain: int) -> Array:

@@ -7,6 +7,7 @@ import pytest
 
 from firmware.geometry import Array
 from firmware.leader import outlook
+from firmware.leader.calibration import CalibrationSettings
 from firmware.leader.manoeuvre import (
     Ground,
     ManoeuvreSettings,
@@ -19,6 +20,7 @@ from firmware.leader.wander import Wandering
 from tests.leader.vessels import sailed
 
 SETTINGS = ManoeuvreSettings()
+FLOOR_M, REDUNDANCY = SETTINGS.closure_floor_m, CalibrationSettings().redundancy
 WANDERING = Wandering(noise=0.2, walk=0.002, apart=0.0007)
 
 
@@ -51,7 +53,7 @@ def test_vehicle_that_can_get_there_goes() -> None:
 
 
 def test_flat_ground_is_not_worth_the_way() -> None:
-    flat = relief_information(np.full((30, 40), 50.0), 2.0, 0.02, SETTINGS)
+    flat = relief_information(np.full((30, 40), 50.0), 2.0, 0.02, REDUNDANCY, FLOOR_M)
     assert propose(lost((-400.0, 0.0), tells=flat), SETTINGS) is None
     assert propose(lost(), SETTINGS) is None
 
@@ -62,23 +64,23 @@ def test_ground_that_is_crossed_anyway_needs_no_proposal() -> None:
 
 def test_relief_tells_along_its_slopes_only() -> None:
     ridges_m = 50.0 + np.sin(np.arange(60) / 4.0)[:, None] * np.ones((60, 40))
-    told = relief_information(ridges_m, 2.0, 0.02, SETTINGS)
+    told = relief_information(ridges_m, 2.0, 0.02, REDUNDANCY, FLOOR_M)
     assert told[0, 0] > 1.0
     assert told[1, 1] < 1e-6
-    assert told[0, 0] <= SETTINGS.closure_floor_m**-2
+    assert told[0, 0] <= FLOOR_M**-2
 
 
 def test_holes_in_a_grid_tell_nothing() -> None:
     depth_m = np.random.default_rng(1).normal(50.0, 1.0, (30, 30))
     holed = depth_m.copy()
     holed[:, 15:] = np.nan
-    whole, half = (relief_information(d, 2.0, 0.02, SETTINGS) for d in (depth_m, holed))
+    whole, half = (relief_information(d, 2.0, 0.02, REDUNDANCY, FLOOR_M) for d in (depth_m, holed))
     assert np.trace(half) < np.trace(whole)
 
 
 @pytest.mark.parametrize("shape", [(1, 40), (40, 1), (1, 1)])
 def test_single_row_of_cells_tells_nothing(shape: tuple[int, int]) -> None:
-    told = relief_information(np.full(shape, 50.0), 2.0, 0.02, SETTINGS)
+    told = relief_information(np.full(shape, 50.0), 2.0, 0.02, REDUNDANCY, FLOOR_M)
     np.testing.assert_array_equal(told, np.zeros((2, 2)))
     assert propose(lost((-400.0, 0.0), tells=told), SETTINGS) is None
 

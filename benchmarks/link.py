@@ -20,6 +20,15 @@ from protocol.timestamps import to_quarters, to_tx_second, transmission_s
 from protocol.vehicles import LEADER
 
 SUBMAP_S = 40
+CASES = (
+    # followers, frames, sub-map seconds
+    (1, 10, 40),
+    (1, 8, 40),
+    (1, 6, 40),
+    (2, 4, 40),
+    (4, 2, 40),
+    (4, 8, 160),
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -176,17 +185,6 @@ def _deliver(
             if follower is not None and packet.missing_fragments:
                 asked_s = transmission_s(packet.header.tx_second, delivery.t_rx_s)
                 follower.queue.request(packet.repeat_submap, packet.missing_fragments, asked_s)
-
-
-CASES = (
-    # followers, frames, sub-map seconds
-    (1, 10, 40),
-    (1, 8, 40),
-    (1, 6, 40),
-    (2, 4, 40),
-    (4, 2, 40),
-    (4, 8, 160),
-)
 
 
 def main(arguments: list[str]) -> None:

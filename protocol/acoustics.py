@@ -16,6 +16,11 @@ from protocol.settings import Settings, setting
 
 Position = tuple[float, float, float]
 """North, east, depth in metres, true."""
+PURPOSES = ("loss", "spell", "corruption", "damage", "duplication", "noise", "outlier")
+PACKED_BYTES = 128
+"""Smaller frames go alone: answers are flexible packets."""
+KEEP_S = 120.0
+"""How long past sounds are remembered for collisions; longer than any frame and travel time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,13 +132,6 @@ class _Interval:
     source: int
     begins_s: float
     ends_s: float
-
-
-PURPOSES = ("loss", "spell", "corruption", "damage", "duplication", "noise", "outlier")
-PACKED_BYTES = 128
-"""Smaller frames go alone: answers are flexible packets."""
-KEEP_S = 120.0
-"""How long past sounds are remembered for collisions; longer than any frame and travel time."""
 
 
 class Water:

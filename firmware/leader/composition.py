@@ -29,6 +29,11 @@ from firmware.leader.ledger import (
 )
 from protocol.settings import Settings, setting
 
+_COARSER = 4  # from level to level, pieces and the age at which they begin alike
+Link = TypeVar("Link", ClosureRecord, RangeRecord)
+Kept = TypeVar("Kept", ClosureRecord, RangeRecord, AbsoluteRecord)
+Group = list[tuple[int, Entry, Kept]]  # of a piece or two: number, entry as it was, as moved
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CompositionSettings(Settings):
@@ -59,12 +64,6 @@ class CompositionSettings(Settings):
     range_floor_m: float = setting(
         1.0, "m", "of composed ranges: sound speed errs alike in all of them", minimum=0.0
     )
-
-
-_COARSER = 4  # from level to level, pieces and the age at which they begin alike
-Link = TypeVar("Link", ClosureRecord, RangeRecord)
-Kept = TypeVar("Kept", ClosureRecord, RangeRecord, AbsoluteRecord)
-Group = list[tuple[int, Entry, Kept]]  # of a piece or two: number, entry as it was, as moved
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -31,6 +31,9 @@ from firmware.leader.pairing import Calibrations, side_of
 from firmware.leader.pose_graph import PoseGraph
 from protocol.settings import Settings, setting
 
+_NEXT_S = (35.0, 90.0)
+"""Neighbours share no soundings with the matched sub-map, and dead reckoning still holds."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JudgementSettings(Settings):
@@ -274,7 +277,3 @@ def _neighbour_pairs(origin: Sheet, target: Sheet, atlas: Atlas) -> list[tuple[S
     pairs = [(o, target) for o in near(origin)] + [(origin, t) for t in near(target)]
     pairs += [(o, t) for o in near(origin) for t in near(target)]
     return [pair for pair in pairs if pair[0].id != pair[1].id]
-
-
-_NEXT_S = (35.0, 90.0)
-"""Neighbours share no soundings with the matched sub-map, and dead reckoning still holds."""

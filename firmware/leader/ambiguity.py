@@ -167,13 +167,7 @@ def posterior(surface: ErrorSurface, evidence: Array, prior: Prior, null_share: 
     """
     cell_m = float(surface.north_m[1] - surface.north_m[0]) if surface.north_m.size > 1 else 1.0
     spread = prior.covariance_m2 + np.eye(2) * cell_m**2 / 12.0
-    north, east = surface.north_m - prior.mean_m[0], surface.east_m - prior.mean_m[1]
-    inverse = np.linalg.inv(spread)
-    square = (
-        inverse[0, 0] * north[:, None] ** 2
-        + 2.0 * inverse[0, 1] * north[:, None] * east[None, :]
-        + inverse[1, 1] * east[None, :] ** 2
-    )
+    square = surface.squares_from(prior.mean_m, spread)
     density = np.exp(-0.5 * np.minimum(square, 1400.0))
     density *= (1.0 - null_share) * cell_m**2 / (2.0 * np.pi * np.sqrt(np.linalg.det(spread)))
     reachable = np.isfinite(evidence) & (density > 0.0)

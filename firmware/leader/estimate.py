@@ -23,7 +23,7 @@ from firmware.leader.ledger import (
 from firmware.leader.nonconvexity import Doubt
 from firmware.leader.solver import Solver
 from firmware.leader.trajectory import Trajectory
-from firmware.leader.wander import DriftChange, Wandering, changes_of
+from firmware.leader.wander import DriftChange, Wandering, changes_of, reckoned_m2
 from firmware.submaps import Track
 from protocol.errors import EstimationError
 
@@ -200,7 +200,7 @@ class Estimate:
             self._newest_covariance[vehicle] = self._solver.covariance([chain.keys[-1]])
         ahead_s = max(time_s - chain.times_s[-1], 0.0)
         carry = np.hstack([np.eye(2), -ahead_s * np.eye(2)])
-        grown_m2 = s.odometry_noise**2 * ahead_s + self._walk**2 * ahead_s**3 / 3
+        grown_m2 = reckoned_m2(ahead_s, s.odometry_noise, self._walk)
         grown_m2 += chain.lost_m2(chain.times_s[-1], time_s)
         covariance = self._newest_covariance[vehicle]
         return np.asarray(carry @ covariance @ carry.T + grown_m2 * np.eye(2))

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from firmware.leader.wander import reckoned_m2
 from protocol.settings import Settings, setting
 
 _SOUND_MPS = 1500.0  # turns times into ranges; a prior needs it no better
@@ -83,7 +84,11 @@ class GraphSettings(Settings):
 
         Starts are known at mission time zero; dead reckoning has run away from them since.
         """
-        alone_s = max(time_s, 0.0)
-        drifted = (self.odometry_noise**2 + self.bias_sigma_mps**2 * alone_s) * alone_s
-        wandered = self.bias_walk**2 * alone_s**3 / 3.0
-        return float(np.sqrt(self.start_sigma_m**2 + drifted + wandered))
+        variance_m2 = reckoned_m2(
+            max(time_s, 0.0),
+            self.odometry_noise,
+            self.bias_walk,
+            start_m=self.start_sigma_m,
+            drift_mps=self.bias_sigma_mps,
+        )
+        return float(np.sqrt(variance_m2))

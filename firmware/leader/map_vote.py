@@ -119,22 +119,22 @@ def _ratio(window: VoteWindow, settings: VoteSettings, tolerated: float) -> floa
     if problem is None:
         return 0.0
     surface = problem.surface()
-    north, east, weight = _predicted(surface, window, settings.reach_sigmas)
-    if weight.size == 0:
+    predicted = _predicted(surface, window, settings.reach_sigmas)
+    if predicted is None:
         return 0.0
-    whole = surface.window(north, east)
     relief = relief_of(problem, surface, window.shift_m)
     if relief is None or relief.background < _LEAST_BACKGROUND * tolerated:
         return 0.0
-    ratio = _log_ratio(whole, problem, relief, settings.pivot, tolerated)
+    allowed, weight = predicted
+    ratio = _log_ratio(allowed, problem, relief, settings.pivot, tolerated)
     mean = float(np.log(np.sum(weight * np.exp(ratio))))
     return float(np.clip(mean, -settings.window_limit, settings.window_limit))
 
 
 def _predicted(
     surface: ErrorSurface, window: VoteWindow, reach_sigmas: float
-) -> tuple[slice, slice, Array]:
-    """Return the rectangle of shifts that the prediction allows, and their weights (sum 1)."""
+) -> tuple[ErrorSurface, Array] | None:
+    """Return the shifts that the prediction allows, if any, and their weights (sum 1)."""
     cell_m = window.query.cell_m
     spread = window.covariance_m2 + np.eye(2) * cell_m**2 / 12.0
     half = np.maximum(reach_sigmas * np.sqrt(np.diag(spread)), cell_m)
@@ -144,18 +144,11 @@ def _predicted(
     ):
         inside = np.flatnonzero(np.abs(axis_m - centre_m) <= half_m)
         if not inside.size:
-            return slice(0), slice(0), np.zeros((0, 0))
+            return None
         ranges.append(slice(int(inside[0]), int(inside[-1]) + 1))
-    north = surface.north_m[ranges[0]] - window.shift_m[0]
-    east = surface.east_m[ranges[1]] - window.shift_m[1]
-    inverse = np.linalg.inv(spread)
-    square = (
-        inverse[0, 0] * north[:, None] ** 2
-        + 2.0 * inverse[0, 1] * north[:, None] * east[None, :]
-        + inverse[1, 1] * east[None, :] ** 2
-    )
-    weight = np.exp(-0.5 * square)
-    return ranges[0], ranges[1], weight / weight.sum()
+    allowed = surface.window(*ranges)
+    weight = np.exp(-0.5 * allowed.squares_from(window.shift_m, spread))
+    return allowed, weight / weight.sum()
 
 
 def _log_ratio(

@@ -66,6 +66,16 @@ class ErrorSurface:
             depth_offset_m=self.depth_offset_m[north, east],
         )
 
+    def squares_from(self, mean_m: Array, covariance_m2: Array) -> Array:
+        """Return squared distances (K, L) of the shifts from a mean, in units of a covariance."""
+        north, east = self.north_m - mean_m[0], self.east_m - mean_m[1]
+        inverse = np.linalg.inv(covariance_m2)
+        return np.asarray(
+            inverse[0, 0] * north[:, None] ** 2
+            + 2.0 * inverse[0, 1] * north[:, None] * east[None, :]
+            + inverse[1, 1] * east[None, :] ** 2
+        )
+
 
 def prepare(grid: GriddedSubmap, *, reconstructed: bool) -> Layer | None:
     """Return the grid cropped to its known cells, or None if no cell is known.

@@ -43,6 +43,17 @@ class DriftChange:
     found: Array
 
 
+def reckoned_m2(
+    duration_s: float, noise: float, walk: float, *, start_m: float = 0.0, drift_mps: float = 0.0
+) -> float:
+    """Return the variance, each axis, of dead reckoning after so long alone.
+
+    start_m and drift_mps are the sigmas of position and drift when it began.
+    """
+    drifted = (noise**2 + drift_mps**2 * duration_s) * duration_s
+    return start_m**2 + drifted + walk**2 * duration_s**3 / 3
+
+
 def changes_of(times_s: Array, bias_mps: Array, expected: Array, found: Array) -> list[DriftChange]:
     """Return the changes between successive epochs (K,) of a drift (K, 2).
 

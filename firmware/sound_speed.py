@@ -62,11 +62,11 @@ class SoundProfile(Settings):
         return (below_m - above_m) / travel_s
 
 
-def horizontal_m(slant_m: float, apart_m: float) -> float:
-    """Return how far a slant range goes across, its ends apart_m in depth; NaN if it is shorter."""
-    if not slant_m >= abs(apart_m):
+def horizontal_m(slant_m: float, depth_difference_m: float) -> float:
+    """Return how far a slant range goes across; NaN if its ends differ by more than it in depth."""
+    if not slant_m >= abs(depth_difference_m):
         return math.nan
-    return math.sqrt((slant_m - apart_m) * (slant_m + apart_m))
+    return math.sqrt((slant_m - depth_difference_m) * (slant_m + depth_difference_m))
 
 
 def _slowness(above_mps: float, below_mps: float) -> float:

@@ -131,11 +131,11 @@ class DriftCorrection:
         leader_m: Array,
         leader_sigma_m: float,
         slant_m: float,
-        apart_m: float,
+        depth_difference_m: float,
     ) -> bool:
-        """Learn from the range to the leader, apart_m in depth; return whether it was believed."""
+        """Learn from the range to the leader; return whether it was believed."""
         s = self._settings
-        range_m = horizontal_m(slant_m, apart_m)
+        range_m = horizontal_m(slant_m, depth_difference_m)
         numbers = [time_s, *reckoned_m, *leader_m, leader_sigma_m, range_m]
         sane = bool(np.isfinite(numbers).all()) and time_s >= self._base.time_s
         if not sane or not s.shortest_range_m <= range_m <= s.longest_range_m:
@@ -147,7 +147,7 @@ class DriftCorrection:
             leader_m=np.asarray(leader_m),
             leader_sigma_m=leader_sigma_m,
             range_m=range_m,
-            apart_m=apart_m,
+            depth_difference_m=depth_difference_m,
         )
         if self._filter.chi_square(self._state_at(time_s), seen) > _CHI_SQUARE_1_99:
             self.ranges_gated += 1

@@ -65,7 +65,7 @@ class AnswerSeen:
 class RangeSeen:
     """A horizontal range to the leader, where the leader was (2,) and dead reckoning was (2,).
 
-    It was measured along a slant between depths that are apart_m apart.
+    It was measured along a slant whose ends differ in depth.
     """
 
     time_s: float
@@ -73,7 +73,7 @@ class RangeSeen:
     leader_m: Array
     leader_sigma_m: float
     range_m: float
-    apart_m: float
+    depth_difference_m: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -215,7 +215,8 @@ class DriftFilter:
         design[0, :2], design[0, 4:6] = -direction, lasting * one.leader_sigma_m * direction
         # beyond the first order: across the range, the position's uncertainty bends it
         across_m2 = float(np.trace(known_m2)) / predicted_m
-        steepness = one.apart_m / predicted_m  # noise counts for more across than along a slant
+        # noise counts for more across than along a slant
+        steepness = one.depth_difference_m / predicted_m
         range_m2 = s.range_sigma_m**2 * (1.0 + steepness**2)
         variance_m2 = range_m2 + (fresh * one.leader_sigma_m) ** 2 + across_m2**2 / 4
         shared = covariance @ design.T

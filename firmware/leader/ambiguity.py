@@ -77,7 +77,7 @@ class Posterior:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Verdict:
+class MassElsewhere:
     """How much mass lies away from the winner, in the plane and away from its line.
 
     axis_rad is the direction from north across the line: the one in which the shift is known.
@@ -223,7 +223,7 @@ def ridge_of(
     )
 
 
-def judge(found: Posterior, winner_m: Array, radius_m: float) -> Verdict:
+def mass_elsewhere(found: Posterior, winner_m: Array, radius_m: float) -> MassElsewhere:
     """Return the mass outside the winner's basin, and outside the line through it."""
     north, east = found.north_m - winner_m[0], found.east_m - winner_m[1]
     square = north[:, None] ** 2 + east[None, :] ** 2
@@ -238,7 +238,7 @@ def judge(found: Posterior, winner_m: Array, radius_m: float) -> Verdict:
     _, vectors = np.linalg.eigh(second)
     across = vectors[:, 0]
     off = np.abs(across[0] * along_n + across[1] * along_e)
-    return Verdict(
+    return MassElsewhere(
         false_mass=1.0 - inside,
         axis_rad=float(np.arctan2(across[1], across[0]) % np.pi),
         false_mass_off_line=1.0 - float(found.mass[off <= radius_m].sum()),

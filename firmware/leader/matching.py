@@ -227,17 +227,17 @@ def _decide(
     covariance = refined.covariance_m2 * settings.covariance_scale
     values, vectors = np.linalg.eigh(covariance)
     sigmas = np.sqrt(values)
-    verdict = ambiguity.judge(found, refined.shift_m, settings.basin_m)
-    certain = verdict.false_mass <= settings.false_mass_limit
+    elsewhere = ambiguity.mass_elsewhere(found, refined.shift_m, settings.basin_m)
+    certain = elsewhere.false_mass <= settings.false_mass_limit
     walk = np.eye(2) * refined.walk_m2
     if certain and sigmas[1] <= settings.sigma_limit_m:
-        return _closure(refined, residual, evidence, covariance + walk, None, verdict.false_mass)
+        return _closure(refined, residual, evidence, covariance + walk, None, elsewhere.false_mass)
     free_m = np.sqrt(vectors[:, 1] @ prior.covariance_m2 @ vectors[:, 1])
     if certain and min(sigmas[1] / 2.0, free_m) <= settings.basin_m:
-        axis, false_mass = vectors[:, 0], verdict.false_mass
-    elif not certain and verdict.false_mass_off_line <= settings.false_mass_limit:
-        axis = np.array([np.cos(verdict.axis_rad), np.sin(verdict.axis_rad)])
-        false_mass = verdict.false_mass_off_line
+        axis, false_mass = vectors[:, 0], elsewhere.false_mass
+    elif not certain and elsewhere.false_mass_off_line <= settings.false_mass_limit:
+        axis = np.array([np.cos(elsewhere.axis_rad), np.sin(elsewhere.axis_rad)])
+        false_mass = elsewhere.false_mass_off_line
     else:
         return _none(NoMatch.AMBIGUOUS)
     line = ambiguity.ridge_of(*ridge, prior, refined.shift_m, axis)

@@ -20,13 +20,13 @@ from protocol.timestamps import transmission_s
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _HeldRange:
-    """A slant range whose sender's track arrives only later; its ends are apart_m in depth."""
+    """A slant range whose sender's track arrives only later."""
 
     chain: int
     sent_s: float
     arrived_s: float
     range_m: float
-    apart_m: float  # in depth
+    depth_difference_m: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,7 +38,7 @@ class _PlacedRange:
 
     sender: int
     range_m: float
-    apart_m: float  # in depth
+    depth_difference_m: float
     clock_m: float
     clock_sigma_m: float
     here: Anchor
@@ -109,16 +109,21 @@ class Ranging:
         sent_s = transmission_s(header.tx_second, toa_s)
         sender_m = depth_m if s.follower_depth_m is None else s.follower_depth_m
         speed_mps = s.sound_profile.speed_mps(sender_m, depth_m, s.sound_speed_mps)
-        range_m, apart_m = (toa_s - sent_s) * speed_mps, abs(sender_m - depth_m)
+        range_m = (toa_s - sent_s) * speed_mps
+        depth_difference_m = abs(sender_m - depth_m)
         if not s.shortest_m <= range_m <= s.longest_m:
             self.counters["ranges_impossible"] += 1
             return
-        if not horizontal_m(range_m, apart_m) > 0.0:
+        if not horizontal_m(range_m, depth_difference_m) > 0.0:
             self.counters["ranges_too_steep"] += 1
             return
         self._held.append(
             _HeldRange(
-                chain=chain, sent_s=sent_s, arrived_s=toa_s, range_m=range_m, apart_m=apart_m
+                chain=chain,
+                sent_s=sent_s,
+                arrived_s=toa_s,
+                range_m=range_m,
+                depth_difference_m=depth_difference_m,
             )
         )
 
@@ -206,7 +211,7 @@ class Ranging:
             return _Fate.BENT
         verdict = self._judge.judge(
             np.array([p.range_m - p.clock_m for p in placed]),
-            np.array([np.hypot(p.predicted_m, p.apart_m) for p in placed]),
+            np.array([np.hypot(p.predicted_m, p.depth_difference_m) for p in placed]),
             np.array([p.there.time_s for p in placed]),
             float(np.hypot(along_m, bent_m)),
         )
@@ -252,12 +257,12 @@ class Ranging:
             if stretched:
                 range_m = p.clock_m + (p.range_m - p.clock_m) / self._settings.outlier_factor
             slant_m = range_m - p.clock_m
-            across_m = horizontal_m(slant_m, p.apart_m)
+            across_m = horizontal_m(slant_m, p.depth_difference_m)
             if across_m > 0.0:
                 yield _BelievedRange(
                     placed=p,
                     range_m=range_m - (slant_m - across_m),
-                    steepness=p.apart_m / across_m,
+                    steepness=p.depth_difference_m / across_m,
                     stretched=bool(stretched),
                 )
 
@@ -285,7 +290,7 @@ def _placed(
     return _PlacedRange(
         sender=sender,
         range_m=held.range_m,
-        apart_m=held.apart_m,
+        depth_difference_m=held.depth_difference_m,
         clock_m=clock_m,
         clock_sigma_m=clock_sigma_m,
         here=here,

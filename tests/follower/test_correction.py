@@ -209,10 +209,10 @@ def test_range_that_cannot_be_is_dropped(bad_m: float) -> None:
 def test_range_counts_as_far_as_it_goes_across_and_less_the_steeper() -> None:
     at_m, leader_m = drift_m(610.0), np.array([400.0, 0.0])
     sigmas_m = []
-    for apart_m in (0.0, 300.0, 800.0):
+    for depth_difference_m in (0.0, 300.0, 800.0):
         correction = taught()
-        slant_m = float(np.hypot(400.0, apart_m))
-        assert correction.receive_range(610.0, at_m, leader_m, 1.0, slant_m, apart_m)
+        slant_m = float(np.hypot(400.0, depth_difference_m))
+        assert correction.receive_range(610.0, at_m, leader_m, 1.0, slant_m, depth_difference_m)
         position_m, covariance_m2 = correction.corrected(610.0, at_m)
         assert position_m[0] == pytest.approx(0.0, abs=2.5)
         sigmas_m.append(float(np.sqrt(covariance_m2[0, 0])))

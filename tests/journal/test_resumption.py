@@ -122,7 +122,7 @@ def test_ranges_keep_the_depth_that_they_arrived_at(undisturbed: Told, killed: T
     leaders = [told.nodes[0].core for told in (undisturbed, killed)]
     ranges = [core._ranging._held for core in leaders if isinstance(core, JournaledLeader)]
     assert ranges[1] == ranges[0]
-    assert len({one.apart_m for one in ranges[0]}) > 1
+    assert len({one.depth_difference_m for one in ranges[0]}) > 1
 
 
 def test_nothing_is_sent_while_catching_up_nor_told_differently(killed: Told) -> None:

@@ -132,7 +132,7 @@ def test_defaults_give_the_graph_the_very_range_that_was_heard() -> None:
     for depth_m in (0.0, 0.1, 500.0):
         (one,) = held(LEVEL, 421.7, 1503.0, depth_m)._held
         assert one.range_m == (8.0 + 421.7 / 1503.0 - 8.0) * 1500.0
-        assert one.apart_m == 0.0
+        assert one.depth_difference_m == 0.0
     arrived_s = [sent_s + 400.3 / 1500.0 for sent_s in SENT_S]
     _, records = ranged(LEVEL, 400.0, arrived_s)
     heard_m = [(toa_s - sent_s) * 1500.0 for sent_s, toa_s in zip(SENT_S, arrived_s, strict=True)]
@@ -154,4 +154,4 @@ def test_leader_ranges_from_the_depth_that_its_odometry_tells() -> None:
     packet = paper_packet()
     header = replace(packet.header, vehicle=1, tx_second=8)
     leader.receive_frame(encode(replace(packet, header=header)), 8.4, 10.5)
-    assert [one.apart_m for one in leader._ranging._held] == [25.0]
+    assert [one.depth_difference_m for one in leader._ranging._held] == [25.0]

@@ -28,7 +28,7 @@ from firmware.leader.offsets import corrections
 from firmware.leader.outlook import Outlook
 from firmware.leader.own_grid import grid_of
 from firmware.leader.pose_graph import PoseGraph
-from firmware.leader.ranging import Ranging
+from firmware.leader.range_windows import Ranging
 from firmware.leader.settings import LeaderSettings, reassembly_of
 from firmware.leader.shelf import Shelf
 from firmware.leader.trajectory import Trajectory

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from firmware.geometry import Array
 from firmware.leader.atlas import chain_of, vehicle_of
 from firmware.leader.pose_graph import PoseGraph
-from firmware.leader.ranging import Ranging
+from firmware.leader.range_windows import Ranging
 from firmware.leader.tracks import TrackBuffer
 from firmware.leader.trajectory import Trajectory
 from firmware.submaps import Track

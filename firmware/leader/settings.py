@@ -13,7 +13,7 @@ from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.judgement import JudgementSettings
 from firmware.leader.manoeuvre import ManoeuvreSettings
 from firmware.leader.matches import MatchingSettings
-from firmware.leader.ranges import RangeSettings
+from firmware.leader.range_judge import RangeSettings
 from firmware.leader.reconstruction import ReconstructionSettings
 from firmware.soundings import SonarSettings
 from firmware.submap_builder import SubmapSettings

@@ -10,8 +10,8 @@ from firmware.leader.composition import CompositionSettings
 from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.ledger import RangeRecord
 from firmware.leader.pose_graph import PoseGraph
-from firmware.leader.ranges import RangeSettings
-from firmware.leader.ranging import Ranging
+from firmware.leader.range_judge import RangeSettings
+from firmware.leader.range_windows import Ranging
 from firmware.submaps import Track
 from tests.protocol.strategies import paper_packet
 

@@ -7,8 +7,8 @@ from firmware.geometry import Array
 from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.ledger import Anchor, RangeRecord
 from firmware.leader.pose_graph import PoseGraph
-from firmware.leader.ranges import RangeSettings
-from firmware.leader.ranging import Ranging
+from firmware.leader.range_judge import RangeSettings
+from firmware.leader.range_windows import Ranging
 from firmware.submaps import Track
 from protocol.packets import Header, Profile
 

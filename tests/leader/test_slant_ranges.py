@@ -8,8 +8,8 @@ import pytest
 from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.ledger import RangeRecord
 from firmware.leader.pose_graph import PoseGraph
-from firmware.leader.ranges import RangeSettings
-from firmware.leader.ranging import Ranging
+from firmware.leader.range_judge import RangeSettings
+from firmware.leader.range_windows import Ranging
 from firmware.sound_speed import SoundProfile
 from firmware.soundings import Odometry
 from firmware.submaps import Track

@@ -4,8 +4,8 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
-from firmware.leader.ranges import RangeSettings
-from firmware.leader.ranging import Ranging, _Fate
+from firmware.leader.range_judge import RangeSettings
+from firmware.leader.range_windows import Ranging, _Fate
 from firmware.submaps import Track
 from tests.protocol.strategies import paper_packet
 

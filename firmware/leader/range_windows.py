@@ -10,7 +10,7 @@ import numpy as np
 from firmware.geometry import offset_covariance
 from firmware.leader.ledger import Anchor
 from firmware.leader.pose_graph import PoseGraph
-from firmware.leader.ranges import RangeJudge, RangeSettings, RangeVerdict
+from firmware.leader.range_judge import RangeJudge, RangeSettings, RangeVerdict
 from firmware.sound_speed import horizontal_m
 from firmware.submaps import Track
 from protocol.errors import EstimationError

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from firmware.geometry import Array
-from firmware.leader.ranges import RangeJudge, RangeSettings
+from firmware.leader.range_judge import RangeJudge, RangeSettings
 
 TIMES_S = np.linspace(0.0, 36.0, 10)
 

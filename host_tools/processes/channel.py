@@ -15,8 +15,8 @@ from host_tools.evaluation import evaluate
 from host_tools.mapping import DepthMap
 from host_tools.mission import Progress, run, simulated_vehicles, water_between
 from host_tools.processes.emulated_modems import MODEMS, EmulatedModems, check_frames
-from host_tools.processes.fleet import Fleet, OnWait
 from host_tools.processes.pace import Pace
+from host_tools.processes.process_group import OnWait, ProcessGroup
 from host_tools.processes.records import FOLDER, VehicleFiles
 from host_tools.processes.remote_node import RemoteNode
 from host_tools.processes.voyage import Voyage, add_voyage_arguments, voyage_of
@@ -27,7 +27,7 @@ from host_tools.simulator.vehicle import SimulatedVehicle
 from host_tools.writers import prepare_folder, write_outputs
 from protocol.acoustics import Delivery
 
-Ready = Callable[[Fleet], None]
+Ready = Callable[[ProcessGroup], None]
 
 
 def host_mission(
@@ -56,31 +56,31 @@ def host_mission(
     emulated = None if modems == "raw" else EmulatedModems(modems, water, deliveries.append)
     paced = progress if pace is None else pace.after(progress)
     duration_s, tick_s = voyage.settings.scenario.duration_s, voyage.tick_s
-    with Fleet(
+    with ProcessGroup(
         water,
         voyage.fingerprint,
         on_wait=on_wait,
         folder=ports,
         pace=pace,
         modems=emulated,
-    ) as fleet:
-        ready(fleet)
-        fleet.wait_for_all()
+    ) as group:
+        ready(group)
+        group.wait_for_all()
         if pace is not None:
             pace.start()
         if emulated is not None:
-            emulated.run(fleet.nodes, duration_s=duration_s, tick_s=tick_s, progress=paced)
+            emulated.run(group.nodes, duration_s=duration_s, tick_s=tick_s, progress=paced)
         else:
             run(
-                fleet.nodes,
+                group.nodes,
                 water,
                 duration_s=duration_s,
                 tick_s=tick_s,
                 record=deliveries.append,
                 progress=paced,
             )
-        fleet.end()
-        lines = {f"line_{node.name}": node.status() for node in fleet.nodes.values()}
+        group.end()
+        lines = {f"line_{node.name}": node.status() for node in group.nodes.values()}
     return _result(voyage, vehicles, files, deliveries, lines)
 
 
@@ -108,10 +108,10 @@ def _result(
     )
 
 
-def vehicle_command(fleet: Fleet, node: RemoteNode, voyage: Voyage, out: Path) -> list[str]:
+def vehicle_command(group: ProcessGroup, node: RemoteNode, voyage: Voyage, out: Path) -> list[str]:
     """Return the arguments after `fathomlink` that start a vehicle's process."""
     name = ["leader"] if node.vehicle == 0 else ["follower", "--vehicle", str(node.vehicle)]
-    ports = ["--modem", fleet.modem_url(node.vehicle), "--clock", fleet.clock_url]
+    ports = ["--modem", group.modem_url(node.vehicle), "--clock", group.clock_url]
     return [*name, *ports, "--out", str(out), *voyage.arguments]
 
 
@@ -184,11 +184,11 @@ def _run(arguments: argparse.Namespace) -> None:
     arguments.changes = [*MODEMS[arguments.modems], *arguments.changes]
     voyage = voyage_of(arguments)
 
-    def ready(fleet: Fleet) -> None:
+    def ready(group: ProcessGroup) -> None:
         print("the ports are open; start each vehicle in a terminal of its own:")
-        for node in fleet.nodes.values():
+        for node in group.nodes.values():
             print(f"\n{node.name} at {node.port.name}:")
-            print("  fathomlink " + shlex.join(vehicle_command(fleet, node, voyage, out)))
+            print("  fathomlink " + shlex.join(vehicle_command(group, node, voyage, out)))
         print(flush=True)
 
     total_s = round(voyage.settings.scenario.duration_s)

@@ -22,7 +22,7 @@ from host_tools.processes.channel import (
     vehicle_command,
 )
 from host_tools.processes.emulated_modems import MODEMS
-from host_tools.processes.fleet import Fleet
+from host_tools.processes.process_group import ProcessGroup
 from host_tools.processes.records import FOLDER
 from host_tools.processes.remote_node import RemoteNode
 from host_tools.processes.voyage import Voyage, add_voyage_arguments, voyage_of
@@ -114,10 +114,10 @@ def run_demo(
     """Run a mission with every vehicle in its own process; return the table of errors."""
     with crew() as processes:
 
-        def ready(fleet: Fleet) -> None:
+        def ready(group: ProcessGroup) -> None:
             (out / FOLDER).mkdir(exist_ok=True)
-            for node in fleet.nodes.values():
-                arguments = vehicle_command(fleet, node, voyage, out)
+            for node in group.nodes.values():
+                arguments = vehicle_command(group, node, voyage, out)
                 processes.start(node.name, arguments, out / FOLDER / f"{node.name}.log")
 
         result = host_mission(

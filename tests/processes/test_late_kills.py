@@ -11,7 +11,7 @@ import pytest
 from firmware.belief import Belief
 from firmware.dead_reckoning import ReckonedState
 from host_tools.processes import vehicle
-from host_tools.processes.fleet import Fleet
+from host_tools.processes.process_group import ProcessGroup
 from host_tools.processes.records import VehicleFiles
 from host_tools.processes.voyage import Voyage, add_voyage_arguments, voyage_of
 from protocol.acoustics import Water, WaterSettings
@@ -32,33 +32,35 @@ def voyage() -> Voyage:
 
 
 @pytest.fixture
-def fleet(voyage: Voyage, tmp_path: Path) -> Iterator[Fleet]:
+def group(voyage: Voyage, tmp_path: Path) -> Iterator[ProcessGroup]:
     water = Water(
         WaterSettings(), np.random.default_rng(1), lambda *_: (0.0, 0.0, 10.0), nodes=range(1)
     )
-    fleet = Fleet(water, voyage.fingerprint, on_wait=lambda _: None, folder=tmp_path / "p")
-    yield fleet
-    fleet.close()
+    group = ProcessGroup(water, voyage.fingerprint, on_wait=lambda _: None, folder=tmp_path / "p")
+    yield group
+    group.close()
 
 
-def lived(fleet: Fleet, voyage: Voyage, folder: Path, store: Path | None) -> BaseException | None:
+def lived(
+    group: ProcessGroup, voyage: Voyage, folder: Path, store: Path | None
+) -> BaseException | None:
     """Run the leader's process to its end; return what ended it."""
     ended: list[BaseException] = []
 
     def live() -> None:
         try:
             out = folder / "out"
-            vehicle.run_vehicle(0, fleet.modem_url(0), fleet.clock_url, voyage, out, "next", store)
+            vehicle.run_vehicle(0, group.modem_url(0), group.clock_url, voyage, out, "next", store)
         except BaseException as error:
             ended.append(error)
 
     thread = threading.Thread(target=live, daemon=True)
     thread.start()
     if not (folder / "out").exists():  # the first life is served its mission
-        fleet.wait_for_all()
+        group.wait_for_all()
         for step in range(round(voyage.settings.scenario.duration_s / 0.25) + 1):
-            fleet.nodes[0].tick(step * 0.25)
-        threading.Thread(target=fleet.end, daemon=True).start()
+            group.nodes[0].tick(step * 0.25)
+        threading.Thread(target=group.end, daemon=True).start()
     thread.join(60.0)
     assert not thread.is_alive()
     return ended[0] if ended else None
@@ -67,7 +69,7 @@ def lived(fleet: Fleet, voyage: Voyage, folder: Path, store: Path | None) -> Bas
 @pytest.mark.parametrize("has_store", [True, False])
 def test_process_killed_after_its_last_instant_ends_the_mission_when_it_starts_again(
     voyage: Voyage,
-    fleet: Fleet,
+    group: ProcessGroup,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     has_store: bool,
@@ -78,8 +80,8 @@ def test_process_killed_after_its_last_instant_ends_the_mission_when_it_starts_a
     store = tmp_path / "store" if has_store else None
     with monkeypatch.context() as patch:
         patch.setattr(vehicle, "_write", killed)
-        assert isinstance(lived(fleet, voyage, tmp_path, store), Killed)
-    again = lived(fleet, voyage, tmp_path, store)
+        assert isinstance(lived(group, voyage, tmp_path, store), Killed)
+    again = lived(group, voyage, tmp_path, store)
     files = {path.name for path in (tmp_path / "out" / "processes").iterdir()}
     if has_store:
         assert again is None

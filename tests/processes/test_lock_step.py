@@ -13,8 +13,8 @@ import pytest
 
 from firmware.ports import ModemPort
 from host_tools.mission import run
-from host_tools.processes.fleet import Fleet
 from host_tools.processes.pace import Pace
+from host_tools.processes.process_group import ProcessGroup
 from host_tools.processes.remote_node import MOST_TRIES, RemoteNode
 from host_tools.processes.served_clock import ServedClock, StampedModem
 from protocol.acoustics import Delivery, Water, WaterSettings
@@ -33,7 +33,7 @@ class Talker:
     """A vehicle that transmits its number and the time in its slot, and keeps what it hears."""
 
     vehicle: int
-    fleet: Fleet
+    group: ProcessGroup
     mission: str = "m"
     stop_at_s: float = float("inf")
     modem_of: int | None = None
@@ -48,8 +48,8 @@ class Talker:
 
     def run(self) -> None:
         port = self.vehicle if self.modem_of is None else self.modem_of
-        modem = StampedModem(open_modem(self.fleet.modem_url(port)))
-        clock = ServedClock(self.fleet.clock_url, self.vehicle, self.mission, modem)
+        modem = StampedModem(open_modem(self.group.modem_url(port)))
+        clock = ServedClock(self.group.clock_url, self.vehicle, self.mission, modem)
         try:
             for now_s in clock.ticks(TICK_S):
                 if now_s >= self.stop_at_s:  # as a killed process: no answer, all lines cut
@@ -79,26 +79,26 @@ def water(settings: WaterSettings = QUIET) -> Water:
 
 
 @pytest.fixture
-def fleet(tmp_path: Path) -> Iterator[Fleet]:
+def group(tmp_path: Path) -> Iterator[ProcessGroup]:
     made = water()
-    with Fleet(made, "m", on_wait=lambda _: None, folder=tmp_path / "ports") as fleet:
-        yield fleet
+    with ProcessGroup(made, "m", on_wait=lambda _: None, folder=tmp_path / "ports") as group:
+        yield group
 
 
 def sail(
-    fleet: Fleet, duration_s: float = 30.0, at: Callable[[float], None] = lambda _: None
+    group: ProcessGroup, duration_s: float = 30.0, at: Callable[[float], None] = lambda _: None
 ) -> list[Delivery]:
     deliveries: list[Delivery] = []
-    fleet.wait_for_all()
+    group.wait_for_all()
     run(
-        fleet.nodes,
-        fleet.water,
+        group.nodes,
+        group.water,
         duration_s=duration_s,
         tick_s=TICK_S,
         record=deliveries.append,
         progress=at,
     )
-    fleet.end()
+    group.end()
     return deliveries
 
 
@@ -106,10 +106,10 @@ def heard_frames(talker: Talker) -> list[bytes]:
     return [reception.frame for reception in talker.heard]
 
 
-def test_frames_and_times_of_arrival_cross_the_ports_unchanged(fleet: Fleet) -> None:
-    talkers = [Talker(vehicle, fleet) for vehicle in (0, 1)]
+def test_frames_and_times_of_arrival_cross_the_ports_unchanged(group: ProcessGroup) -> None:
+    talkers = [Talker(vehicle, group) for vehicle in (0, 1)]
     threads = [talker.start() for talker in talkers]
-    deliveries = sail(fleet)
+    deliveries = sail(group)
     for thread in threads:
         thread.join()
     for talker in talkers:
@@ -122,16 +122,18 @@ def test_frames_and_times_of_arrival_cross_the_ports_unchanged(fleet: Fleet) -> 
         assert len(expected) >= 7
 
 
-def test_garbage_half_frames_and_foreign_traffic_cost_nothing_but_counts(fleet: Fleet) -> None:
-    talkers = [Talker(vehicle, fleet) for vehicle in (0, 1)]
+def test_garbage_half_frames_and_foreign_traffic_cost_nothing_but_counts(
+    group: ProcessGroup,
+) -> None:
+    talkers = [Talker(vehicle, group) for vehicle in (0, 1)]
     threads = [talker.start() for talker in talkers]
     noise = bytes(range(1, 200)) + wrap(b"not from this water") + wrap(b"half a frame")[:6]
 
     def disturb(now_s: float) -> None:
         if now_s % 3.0 == 0.25:
-            fleet.nodes[1].port.write(noise)
+            group.nodes[1].port.write(noise)
 
-    deliveries = sail(fleet, at=disturb)
+    deliveries = sail(group, at=disturb)
     for thread in threads:
         thread.join()
     water_frames = [d.frame for d in deliveries if d.destination == 1]
@@ -142,17 +144,17 @@ def test_garbage_half_frames_and_foreign_traffic_cost_nothing_but_counts(fleet: 
     assert heard_frames(talkers[0]) == [d.frame for d in deliveries if d.destination == 0]
 
 
-def test_a_port_that_vanishes_and_comes_back_loses_no_arrival(fleet: Fleet) -> None:
-    talkers = [Talker(vehicle, fleet) for vehicle in (0, 1)]
+def test_a_port_that_vanishes_and_comes_back_loses_no_arrival(group: ProcessGroup) -> None:
+    talkers = [Talker(vehicle, group) for vehicle in (0, 1)]
     threads = [talker.start() for talker in talkers]
 
     def pull(now_s: float) -> None:
         if now_s == 9.0:
-            fleet.nodes[1].port.unplug()
+            group.nodes[1].port.unplug()
         if now_s == 17.0:
-            fleet.nodes[1].port.plug()
+            group.nodes[1].port.plug()
 
-    deliveries = sail(fleet, duration_s=40.0, at=pull)
+    deliveries = sail(group, duration_s=40.0, at=pull)
     for thread in threads:
         thread.join()
     assert heard_frames(talkers[1]) == [d.frame for d in deliveries if d.destination == 1]
@@ -163,19 +165,19 @@ def test_a_port_that_vanishes_and_comes_back_loses_no_arrival(fleet: Fleet) -> N
 
 
 def test_a_process_that_is_killed_is_waited_for_and_loses_nothing(tmp_path: Path) -> None:
-    with Fleet(water(), "m", on_wait=lambda _: None, folder=tmp_path) as fleet:
-        leader = Talker(0, fleet)
-        first = Talker(1, fleet, stop_at_s=12.75)
+    with ProcessGroup(water(), "m", on_wait=lambda _: None, folder=tmp_path) as group:
+        leader = Talker(0, group)
+        first = Talker(1, group, stop_at_s=12.75)
         threads = [leader.start(), first.start()]
-        second = Talker(1, fleet)
+        second = Talker(1, group)
 
         def restart(missing: Sequence[RemoteNode]) -> None:
             if missing and missing[0].now_s > 0.0 and len(threads) == 2:
                 assert missing[0].now_s == 12.75
                 threads.append(second.start())
 
-        fleet.on_wait = restart
-        deliveries = sail(fleet)
+        group.on_wait = restart
+        deliveries = sail(group)
         for thread in threads:
             thread.join()
     assert len(threads) == 3
@@ -185,16 +187,16 @@ def test_a_process_that_is_killed_is_waited_for_and_loses_nothing(tmp_path: Path
 
 
 def test_an_arrival_that_the_line_never_hands_over_is_given_up(
-    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+    group: ProcessGroup, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("host_tools.processes.served_clock.HANDOVER_S", 0.0)
-    monkeypatch.setattr(fleet.nodes[1].port, "write", lambda _: None)
-    talkers = [Talker(vehicle, fleet) for vehicle in (0, 1)]
+    monkeypatch.setattr(group.nodes[1].port, "write", lambda _: None)
+    talkers = [Talker(vehicle, group) for vehicle in (0, 1)]
     threads = [talker.start() for talker in talkers]
-    sail(fleet, duration_s=11.0)
+    sail(group, duration_s=11.0)
     for thread in threads:
         thread.join()
-    status = fleet.nodes[1].status()
+    status = group.nodes[1].status()
     assert talkers[1].heard == []
     assert status["arrivals_lost_on_line"] == len(talkers[0].sent)
     assert status["arrivals_repeated"] == (MOST_TRIES - 1) * len(talkers[0].sent)
@@ -209,18 +211,18 @@ def test_an_arrival_that_the_line_never_hands_over_is_given_up(
     ],
 )
 def test_a_process_that_does_not_belong_is_told_why(
-    vehicle: int, mission: str, message: str, fleet: Fleet
+    vehicle: int, mission: str, message: str, group: ProcessGroup
 ) -> None:
-    leader = Talker(0, fleet)
+    leader = Talker(0, group)
     threads = [leader.start()]
-    while fleet.nodes[0].line is None:
-        fleet.look()
-    stranger = Talker(vehicle, fleet, mission, modem_of=1)
+    while group.nodes[0].line is None:
+        group.look()
+    stranger = Talker(vehicle, group, mission, modem_of=1)
     threads.append(stranger.start())
     while threads[1].is_alive():
-        fleet.look()
+        group.look()
     assert message in str(stranger.error)
-    fleet.close()
+    group.close()
     threads[0].join()
     assert "has gone; start all again" in str(leader.error)
 
@@ -242,21 +244,21 @@ class FastPace(Pace):
 
 def test_in_real_time_a_process_that_is_down_is_not_waited_for(tmp_path: Path) -> None:
     pace = FastPace(TICK_S / 1000.0)
-    with Fleet(water(), "m", on_wait=lambda _: None, folder=tmp_path, pace=pace) as fleet:
-        leader, follower = Talker(0, fleet), Talker(1, fleet, stop_at_s=5.0)
+    with ProcessGroup(water(), "m", on_wait=lambda _: None, folder=tmp_path, pace=pace) as group:
+        leader, follower = Talker(0, group), Talker(1, group, stop_at_s=5.0)
         threads = [leader.start(), follower.start()]
-        fleet.wait_for_all()
+        group.wait_for_all()
         pace.start()
         deliveries: list[Delivery] = []
         run(
-            fleet.nodes,
-            fleet.water,
+            group.nodes,
+            group.water,
             duration_s=20.0,
             tick_s=TICK_S,
             record=deliveries.append,
         )
-        fleet.end()
-        missed = fleet.nodes[1].status()["periods_missed"]
+        group.end()
+        missed = group.nodes[1].status()["periods_missed"]
         for thread in threads:
             thread.join()
     assert missed >= 55

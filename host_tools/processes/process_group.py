@@ -28,7 +28,7 @@ BACKLOG = 8
 OnWait = Callable[[Sequence[RemoteNode]], None]
 
 
-class Fleet:
+class ProcessGroup:
     """Ports, control socket and nodes; the clock stands still while a process is down.
 
     on_wait is called now and then while processes are waited for, with those that are missing; it
@@ -43,7 +43,7 @@ class Fleet:
         on_wait: OnWait,
         folder: Path | None = None,
         pace: Pace | None = None,
-        modems: "EmulatedModems | None" = None,
+        modems: EmulatedModems | None = None,
     ) -> None:
         self.water, self.on_wait = water, on_wait
         self._mission, self._pace = mission, pace
@@ -59,7 +59,7 @@ class Fleet:
         for node in self.nodes.values():
             node.in_real_time = pace is not None
 
-    def __enter__(self) -> "Fleet":
+    def __enter__(self) -> "ProcessGroup":
         return self
 
     def __exit__(

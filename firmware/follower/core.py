@@ -142,7 +142,7 @@ class FollowerCore:
             self._fit.best = step
 
     def poll(self, now_s: float) -> bytes | None:
-        """Return a frame to transmit now, or None; as many a slot as it holds, one each call."""
+        """Return a frame to transmit now, or None: one a call, as many a slot as it holds."""
         slot_s = self._turns.due_s(now_s)
         if slot_s is None:
             return None
@@ -257,7 +257,7 @@ class FollowerCore:
         return list(self._track)[-_IDLE_STATES:]
 
     def _receive_range(self, answer: ExtendedAnswer, toa_s: float, now_s: float) -> None:
-        """Range-aid: the answer says where the leader was, its way how far that is from here."""
+        """Use an answer as a range: it says where the leader was, its travel time how far away."""
         if not abs(now_s - toa_s) <= _LONGEST_AIRTIME_S:
             self.counters["ranges_unplaceable"] += 1
             return

@@ -157,7 +157,7 @@ class DriftCorrection:
         return True
 
     def lose(self, begin_s: float, end_s: float) -> None:
-        """Doubt a span of which nobody knows how far the vehicle went, and what it goes on from."""
+        """Doubt a span in which the motion is unknown; a long one is told in parts."""
         if not self._losing_s[0] <= begin_s <= self._losing_s[1] <= end_s:
             self._losing_s = begin_s, begin_s
         begun_s, told_s = self._losing_s

@@ -37,10 +37,10 @@ class DriftSettings(Settings):
     bias_sigma_mps: float = setting(0.15, "m/s", "unmeasured current at the start", minimum=1e-4)
     bias_walk: float = setting(0.004, "m/s/sqrt(s)", "how the current wanders", minimum=1e-7)
     walk_factor: float = setting(
-        2.0, "1", "by which that may well be wrong, until answers tell", minimum=1.01
+        2.0, "1", "by which the walk may well be wrong before answers tell", minimum=1.01
     )
     walk_memory_s: float = setting(
-        3600.0, "s", "in which what they told of it fades: tides turn", minimum=60.0
+        3600.0, "s", "over which what they told of it fades: tides turn", minimum=60.0
     )
     leader_alike_s: float = setting(
         150.0, "s", "the leader's errors are alike for half a survey line, between closures",
@@ -78,9 +78,9 @@ class RangeSeen:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LostSpan:
-    """What a span up to the time, of which nobody knows how far the vehicle went, adds: a variance.
+    """The variance that a span up to the time adds, in which the vehicle's motion is unknown.
 
-    A longer one comes in parts: then each has what it adds to those before it.
+    A long span comes in parts, each with what it adds to those before it.
     """
 
     time_s: float

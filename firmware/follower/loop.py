@@ -11,7 +11,7 @@ from protocol.modems.base import Modem, Reception
 class FollowerLoop:
     """Reads ports, runs the core, writes ports; `step` is called once a period of the clock.
 
-    stopwatch returns seconds that deadlines are held against; in virtual time it stands still.
+    stopwatch returns the seconds by which deadlines are judged; in virtual time it stands still.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""What a follower transmits: fragments, what was lost of them, or its trajectory alone."""
+"""What a follower transmits: fragments, repeats of lost ones, or its trajectory alone."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ class Outbox:
         self._trajectory_packets = 0
 
     def add(self, packets: Sequence[SubmapPacket] | Sequence[SubmapFragment]) -> bool:
-        """Queue a sub-map; none at all while half of one still waits, for it would only age."""
+        """Queue a sub-map, unless half of an earlier one still waits: it would only grow old."""
         if 2 * self._queue.fresh >= max(len(packets), 2):
             self.counters["submaps_without_air"] += 1
             return False
@@ -35,7 +35,7 @@ class Outbox:
         return True
 
     def request(self, submap: int, bitmap: int, asked_s: float) -> None:
-        """Take the leader's wish for fragments that it lacks."""
+        """Take the leader's request for fragments that it lacks."""
         self._queue.request(submap, bitmap, asked_s)
 
     def next_packet(

@@ -38,7 +38,7 @@ class FollowerSettings(Settings):
         4, "steps", "of the fit between two pings; one of `paper` then ends within 16 s", minimum=1
     )
     track_s: float = setting(
-        600.0, "s", "of own track kept to place answers by; they are two minutes old", minimum=60.0
+        600.0, "s", "of own track kept to place answers on, which are two minutes old", minimum=60.0
     )
 
     @property

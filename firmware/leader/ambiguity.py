@@ -2,19 +2,18 @@
 
 Every lattice shift is compared with the hypothesis that the two sub-maps show unrelated seabed.
 Let x = E / v be the mean square difference over the overlap in units of the noise there. Under a
-match x is about 1, of partly unknown scale; under no match it is what it is at shifts chosen
-blindly, the background b. With I the information per cell that the relief's spectrum offers
+match x is about 1, of partly unknown scale; under no match it is as large as at shifts chosen
+blindly: the background b. With I the information per cell that the relief's spectrum offers
 (`relief`), the log evidence of N cells is
 
     I [min(N, C) - N (1 - f(x) / f(1))],
     f(x) = log(b / max(1, x)) - x / max(1, x) + x / b  for x < b, else 0,
 
-and never below zero. Misfit counts on all cells, but fit only on C of them: ripples go on, and more
-of the same beneath a larger overlap proves nothing new.
+and never below zero. Misfit counts on all cells, but fit on C of them at most: ripples repeat, and
+more of them beneath a larger overlap prove nothing new.
 
 It grows with relief and overlap, is zero on a flat seabed, and falls off as a power of E rather
-than exponentially, so that misfit which the noise model does not know cannot crown a small, lucky
-overlap.
+than exponentially, so that misfit beyond the noise model cannot let a small, lucky overlap win.
 """
 
 import math
@@ -38,7 +37,7 @@ _LEAST_GAIN = 0.3  # f(1) of a background of 2.3; below it the surface hardly ha
 
 
 class Ridge(NamedTuple):
-    """Where shifts slide that fit alike: across which axis, how surely, and how far it bends."""
+    """A line along which shifts fit equally well, by the axis across it, and how surely."""
 
     axis: Array  # (2,) unit vector across the ridge
     sigma_rad: float
@@ -99,7 +98,7 @@ def background(surface: ErrorSurface, best_m: Array, away_m: float) -> float | N
 
 
 def tolerated_misfit(misfit: float, independent_cells: float) -> float:
-    """Return the E / noise up to which a shift counts as good as the best, whose is given.
+    """Return the E / noise up to which a shift counts as good as the best, given the best one's.
 
     Mean squares of so many independent cells fluctuate, by a fifth at least; neighbours in a
     reconstruction err together, and few are independent. Where even the best fits worse than the
@@ -160,10 +159,10 @@ def moments(found: Posterior, prior: Prior) -> tuple[Array, Array]:
 
 
 def posterior(surface: ErrorSurface, evidence: Array, prior: Prior, null_share: float) -> Posterior:
-    """Return the mass of every shift and of `elsewhere`.
+    """Return the probability mass of every shift, and of all that is no shift of the surface.
 
-    The prior is the graph's Gaussian, of which null_share is spread on nothing: the pose graph may
-    be wrong, and then no shift is right.
+    The prior is the graph's Gaussian, of which null_share is withheld from all shifts: the pose
+    graph may be wrong, and then none of them is right.
     """
     cell_m = float(surface.north_m[1] - surface.north_m[0]) if surface.north_m.size > 1 else 1.0
     spread = prior.covariance_m2 + np.eye(2) * cell_m**2 / 12.0
@@ -188,11 +187,12 @@ def posterior(surface: ErrorSurface, evidence: Array, prior: Prior, null_share: 
 def ridge_of(
     surface: ErrorSurface, limit: float, prior: Prior, winner_m: Array, axis: Array
 ) -> Ridge:
-    """Return the line along which shifts go on fitting from the winner, about across the axis.
+    """Return the line along which shifts keep fitting from the winner, roughly across the axis.
 
-    Of the shifts abreast of each other the best stands for the ridge if its misfit is within the
-    limit. A line is fitted to as much of it as a prior three times as wide allows: its direction
-    has to hold where the prior may be wrong. How much of the rest counts is for the prior to say.
+    Of the shifts side by side across the line, the best belongs to the ridge if its misfit is
+    within the limit. The line is fitted to as much of the ridge as a prior three times as wide
+    allows, since its direction has to hold where the prior is wrong; how far the ridge strays from
+    the line is weighted by the prior itself.
     """
     misfit = surface.residual_m2 / surface.noise_m2
     row, column = np.nonzero(np.isfinite(misfit) & (misfit <= limit))

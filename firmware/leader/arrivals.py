@@ -59,7 +59,7 @@ class Arrivals:
             self._reassembler.receive(packet, now_s)
 
     def sheets(self, now_s: float) -> Iterator[Sheet | None]:
-        """Take what the reassembly has let through; yield a sheet, None if empty, per sub-map."""
+        """Yield the sheet of each sub-map that the reassembly hands on, None if it is empty."""
         self._reassembler.advance(now_s)
         while (event := self._reassembler.next_event()) is not None:
             if isinstance(event, FragmentArrived):

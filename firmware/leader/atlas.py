@@ -19,7 +19,7 @@ FOOTPRINT_M = 10.0
 
 
 def chain_of(vehicle: int, boot: int) -> int:
-    """Return the number of the graph's chain that a boot of a vehicle is; the leader has one."""
+    """Return the number of the graph's chain for a boot of a vehicle; the leader has one."""
     return LEADER if vehicle == LEADER else boot * BOOT_EPOCHS + vehicle
 
 
@@ -30,7 +30,7 @@ def vehicle_of(chain: int) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SheetId:
-    """Which sub-map of which vehicle, in which of its boots: epochs counted on without a wrap."""
+    """A sub-map of one boot of a vehicle; boot epochs are counted without wrapping."""
 
     vehicle: int
     boot_epoch: int
@@ -103,8 +103,8 @@ def overlap_m2(origin: Sheet, target: Sheet, shifts_m: Array) -> Array:
 class Atlas:
     """Sheets to match with, by id in the order of their arrival; the others are on the shelf.
 
-    What the shelf refuses stays in memory, packed, and so in checkpoints.
-    The oldest leave for good when there are more than the cap of all together.
+    What the shelf refuses stays in memory, packed, and thus in checkpoints. Where there are more
+    than the cap, shelved ones included, the oldest are dropped.
     """
 
     def __init__(self, capacity: int, shelf: Shelf | None = None) -> None:

@@ -1,9 +1,9 @@
 """Each vehicle's roll bias, refraction smile and depth wander, learned from its own overlaps.
 
-A patch test without end: where a vehicle crosses or neighbours its own soundings and dead
-reckoning still knows the way between them, the two passes differ by what the sonar does wrong. A
-fit of offset, shift (with the graph's prior) and swath errors leaves information on roll and smile,
-summed recursively and slowly forgotten, for water changes.
+A patch test that never ends: where a vehicle crosses its own soundings or runs beside them, and
+dead reckoning still knows the way between the two passes, they differ by the sonar's errors. A fit
+of depth offset, shift (with the graph's prior) and swath errors gives information on roll and
+smile, which is summed recursively and slowly forgotten, because water changes.
 """
 
 from dataclasses import dataclass
@@ -58,7 +58,7 @@ class CalibrationSettings(Settings):
 class Overlap:
     """Two passes over the same ground; the shift's prior is the graph's.
 
-    Sides of another vehicle than the one to be calibrated come levelled and without a swath.
+    A side of a vehicle other than the one being calibrated comes levelled and without a swath.
     """
 
     reference: GriddedSubmap
@@ -199,7 +199,7 @@ def _system(field: Aligned, swath: Array, settings: CalibrationSettings) -> _Sys
 
 
 def _pure(grid: GriddedSubmap, swath: Swath | None) -> GriddedSubmap:
-    """Return the grid where its across-track distance is meant."""
+    """Return the grid where its across-track distance means something."""
     if swath is None:
         return grid
     return GriddedSubmap(

@@ -22,8 +22,8 @@ class Chain:
 
     There is no clock where none is estimated.
 
-    `shape` is the estimate, as it was, of the part of which only some nodes are left. `lost` are
-    the spans, first and last second, of which nobody knows how far the vehicle went.
+    `shape` is the trajectory as it was last estimated where only some nodes are left. `lost` are
+    the spans, first and last second, in which the vehicle's motion is unknown.
     """
 
     number: int
@@ -65,7 +65,7 @@ class Chain:
         return _nearest(self.times_s, time_s)
 
     def in_shape_s(self, time_s: float) -> float:
-        """Return the time nearest to a time at which there was a node when the shape was kept."""
+        """Return the time of the shape's node that is nearest to a time."""
         assert self.shape is not None
         times_s = self.shape.time_s
         after = int(np.searchsorted(times_s, time_s))
@@ -128,9 +128,9 @@ def _nearest(times_s: list[float], time_s: float) -> int:
 def shared_walk(
     first: Chain, chain: Chain, begin_s: float, end_s: float, bias_walk_apart: float
 ) -> list[SharedWalkRecord]:
-    """Return that a chain's bias has changed over an interval as the first chain's has.
+    """Return the record that a chain's bias changed as the first chain's did, if any.
 
-    Nothing is said when one of the four nodes is not there.
+    There is none where one of the four nodes is missing.
     """
     if chain is first:
         return []

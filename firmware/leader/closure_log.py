@@ -1,4 +1,4 @@
-"""What is left of closures on which nothing more can be decided: a row of bytes each."""
+"""Closures on which nothing more will be decided, kept as a row of bytes each."""
 
 import math
 import struct

@@ -13,10 +13,13 @@ class ClosureSettings(Settings):
         12, "pairs", "a tenth of a second of work; some seconds while drift is unknown", minimum=1
     )
     known_pairs_per_submap: int = setting(
-        3, "pairs", "of those whose offset is known already; more would say it again", minimum=1
+        3, "pairs", "of them whose offset is known already; more would only repeat it", minimum=1
     )
     known_sigma_m: float = setting(
-        2.0, "m", "an offset so well known is known; a match tells it to half a metre", minimum=0.1
+        2.0,
+        "m",
+        "from here on an offset counts as known; a match tells it to half a metre",
+        minimum=0.1,
     )
     screened_per_submap: int = setting(
         48, "sub-maps", "nearest ones whose joint covariance is asked for", minimum=1
@@ -24,14 +27,14 @@ class ClosureSettings(Settings):
     second_looks: int = setting(
         3,
         "sub-maps",
-        "asked with each new one whether their open pairs are known better",
+        "whose open pairs are reviewed with each new one",
         minimum=0,
     )
     second_look_share: float = setting(
         0.7, "1", "of the radius at the last look: half the area to look for a pair in", minimum=0.0
     )
     open_submaps: int = setting(
-        256, "sub-maps", "with open pairs; the longest not looked at go", minimum=1
+        256, "sub-maps", "with open pairs; those not looked at for longest go", minimum=1
     )
     shortest_gap_s: float = setting(
         41.0, "s", "nearer in time, sub-maps of one vehicle share their soundings", minimum=0.0
@@ -42,7 +45,7 @@ class ClosureSettings(Settings):
     hint_prior_m: float = setting(
         8.0,
         "m",
-        "an offset known better than so learns nothing from an ambiguous pair",
+        "an offset known better than this learns nothing from an ambiguous pair",
         minimum=0.0,
     )
     hint_span_s: float = setting(

@@ -1,4 +1,4 @@
-"""Loop closures: what becomes of what the matches find, up to the gate and the ledger."""
+"""Loop closures: from what a match found to the gate and the ledger."""
 
 import dataclasses
 import enum
@@ -52,9 +52,9 @@ def closure_of(
 ) -> Closure | None:
     """Return the closure that a match found, or None.
 
-    The shift lies between the grids as they agree with dead reckoning at their own instants; the
-    closure is stated between the positions at the mean times of the overlap, and for the place
-    where both really looked.
+    The shift is between grids that agree with dead reckoning at the times of their sheets; the
+    closure is between the positions at the mean times of the overlap, and corrected for where both
+    sonars really looked.
     """
     if outcome.match is None:
         return None
@@ -87,7 +87,7 @@ def closure_of(
 def enter_hint(
     job: MatchJob, hint: Hint, graph: PoseGraph, settings: ClosureSettings
 ) -> int | None:
-    """Let a hint lean on the estimate; return its number, None where the graph knows as much.
+    """Enter a hint, active; return its number, or None where the graph knows as much already.
 
     Raises EstimationError where a sub-map hangs on no node.
     """

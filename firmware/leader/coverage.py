@@ -1,4 +1,4 @@
-"""Which old sub-maps are still needed to be matched with: enough of them over every place."""
+"""Which old sub-maps are still needed for matching: enough of them over every place."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from protocol.settings import Settings, setting
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CoverageSettings(Settings):
-    """How often a place is kept."""
+    """How many sub-maps a place needs."""
 
     layers: int = setting(
         6, "sub-maps", "over a place: two passes of each of two vehicles, nearly", minimum=1

@@ -3,9 +3,9 @@
 Depths that err by roll * y + smile * y^2 / W (see `swath`) betray beams that are turned by the roll
 and, by Snell's law, bent: a place seen at the across-track distance y, an altitude h below, really
 lies h * (roll + 2 * smile * y / W) farther to starboard: half of the second term is Snell's law at
-the sonar, half the scale of its ranges. Lines of opposite heading seem too near each other by it,
-or too far, and every closure between them says the same: what is not known of it yet is taken for
-noise of each, which is too good a view of many.
+the sonar, half the scale of its ranges. It makes lines of opposite heading seem too near to each
+other, or too far apart, and every closure between them alike. What is not known of it yet counts as
+independent noise of each closure, which is too optimistic where there are many.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from firmware.geometry import Array
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Look:
-    """One vehicle's look at a place: to starboard (2,), unit, from an altitude, half a swath wide.
+    """How a vehicle saw a place: unit vector to starboard (2,), altitude, half the swath's width.
 
     errors (2,) are what is known of its roll in rad and its smile, covariance (2, 2) how well.
     """
@@ -36,9 +36,9 @@ class Look:
 
 
 def displaced(looks: tuple[Look, Look], levers_m: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Return what is to be added (2,) to the offset of two vehicles that saw one place.
+    """Return the correction (2,) of the offset of two vehicles at one place, and its covariance.
 
-    The offset is that of the second from the first. The covariance (2, 2) is what is left.
+    The offset is that of the second from the first.
     """
     first, second = (look.displacement(lever) for look, lever in zip(looks, levers_m, strict=True))
     added_m = first @ looks[0].errors - second @ looks[1].errors

@@ -1,8 +1,8 @@
-"""What the offset of two sub-maps tells of their drifts, and a match in which it does.
+"""What the offset of two sub-maps tells of their drifts, and matching that makes use of it.
 
-Cells of a sub-map are older or younger than its middle, and drift strains it. What ran away farther
-than expected has drifted faster: a shift far from the expected one says by how much, and is to be
-judged with sub-maps from which that drift was taken.
+Cells of a sub-map are older or younger than its middle, and drift strains it. A shift far from the
+expected one implies another drift than the expected one, and has to be judged with sub-maps from
+which that other drift was taken.
 """
 
 import dataclasses
@@ -33,8 +33,8 @@ _NO_OVERLAP = np.array([np.inf, 1.0, 0.0, 0.0])  # in the same order
 class Drifts:
     """How well the drifts of two sub-maps are known, and what their offset would tell of them.
 
-    gain (4, 2) is by how much they grow, the origin's first, for each metre that the offset is more
-    than expected; left (4, 4) in (m/s)^2 is their covariance once the offset is known.
+    gain (4, 2) is how much they change, the origin's first, per metre of offset beyond the expected
+    one; left (4, 4) in (m/s)^2 is their covariance once the offset is known.
     """
 
     gain: Array
@@ -79,8 +79,9 @@ def screened_by_drift(
 ) -> ErrorSurface:
     """Return a surface with E at every lattice shift for the drift that the shift implies.
 
-    The grids of reference and query come without the drift that is expected; `surface` is theirs,
-    or a window of it, and is returned where that drift serves for all shifts that the prior leaves.
+    The expected drift has been taken out of both grids, reference and query. `surface` is theirs,
+    or a window of it, and is returned as it is where that drift serves for all shifts that the
+    prior allows.
     """
     steps_m = drifts.steps_m(prior.covariance_m2)
     if all(len(steps) == 1 for steps in steps_m):

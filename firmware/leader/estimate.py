@@ -1,7 +1,7 @@
 """What the pose graph makes of its ledger: where everyone was, and how sure that is.
 
-Nothing is told here; an estimate is brought up to its ledger by `update`, and wherever it is asked
-for a covariance.
+Nothing is entered here. `update` brings an estimate up to its ledger, and so does asking for a
+covariance.
 """
 
 import itertools

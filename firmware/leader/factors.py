@@ -123,7 +123,7 @@ def _closure(record: ClosureRecord, noise: gtsam.noiseModel.Base) -> gtsam.Nonli
 
 
 def _range(record: RangeRecord, noise: gtsam.noiseModel.Base) -> gtsam.NonlinearFactor:
-    """Return a factor of what a closure is of, and of a clock where one is estimated."""
+    """Return a factor of a closure's variables, and of a clock where one is estimated."""
     ways = _way(record.origin, record.target)
     clocks = [] if record.clock is None else [record.clock]
 

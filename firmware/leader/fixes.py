@@ -1,7 +1,7 @@
 """Absolute positions: GNSS at the surface, USBL from a ship or about a follower. Judged, then used.
 
-A fix waits until the dead reckoning of the vehicle it speaks of is known at its time. It is held
-against the estimate's own covariance: one that is impossible by it is counted and dropped.
+A fix waits until its vehicle's dead reckoning is known at its time. It is gated by the estimate's
+own covariance: an impossible one is counted and dropped.
 """
 
 from collections import Counter, deque
@@ -24,7 +24,7 @@ class FixSettings(Settings):
         13.8, "1", "99.9 % of true innovations of two components pass", minimum=1.0
     )
     sigma_floor_m: float = setting(
-        1.0, "m", "way between the antenna, the instant and the key frame", minimum=0.0
+        1.0, "m", "for the way from the antenna and the instant to the key frame", minimum=0.0
     )
     sigma_limit_m: float = setting(
         1e4, "m", "a fix that is worse says nothing of a survey", minimum=1.0

@@ -1,10 +1,10 @@
 """The followers as the leader knows them: one chain of the graph for each boot of each vehicle.
 
-A vehicle that restarts counts its sub-maps from zero and may begin dead reckoning anew; one whose
-navigation was lost for a while calls that a boot, too. What was known of it stays where it is; the
-new boot is a chain of its own, tied to the old one by how far the vehicle can have come meanwhile.
-A boot is the header's epoch, unrolled; dead reckoning that jumps for good without a restart is
-taken for a boot of the same epoch.
+A vehicle that restarts counts its sub-maps from zero and may begin dead reckoning anew; one that
+lost its navigation for a while announces a new boot, too. What was known of it stays where it is;
+the new boot is a chain of its own, tied to the old one by how far the vehicle can have come
+meanwhile. A boot is the header's epoch, unwrapped; a lasting jump of dead reckoning without a
+restart counts as another boot of the same epoch.
 """
 
 from collections import Counter, deque
@@ -77,7 +77,7 @@ class Fleet:
         return sorted({vehicle_of(chain) for chain in self._graph.vehicles()})
 
     def boot_of(self, header: Header) -> int:
-        """Return which boot a frame is of; of late frames an earlier one than the newest."""
+        """Return the boot of a frame; a late frame's may be earlier than the newest."""
         known = self._followers.get(header.vehicle)
         if known is None:
             known = self._followers[header.vehicle] = _Vehicle(boot=header.boot_epoch)

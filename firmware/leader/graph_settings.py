@@ -33,17 +33,20 @@ class GraphSettings(Settings):
         0.004, "m/s/sqrt(s)", "lets a current of 0.2 m/s turn within an hour", minimum=1e-7
     )
     walk_factor: float = setting(
-        2.0, "1", "by which that may well be wrong, until the mission tells", minimum=1.01
+        2.0, "1", "by which the walk may well be wrong before the mission tells", minimum=1.01
     )
     walk_interval_s: float = setting(
         300.0, "s", "over which drift is compared to learn it: half a survey line", minimum=60.0
     )
     walk_memory_s: float = setting(3600.0, "s", "of drift that is compared", minimum=600.0)
     walk_apart: float = setting(
-        0.175, "1", "of it is one vehicle's own: a current turns for all in it alike", minimum=1e-3
+        0.175,
+        "1",
+        "of the walk is each vehicle's own: a current turns for all in it alike",
+        minimum=1e-3,
     )
     alike_interval_s: float = setting(
-        60.0, "s", "how often that is said: chains stay loosely coupled", minimum=10.0
+        60.0, "s", "between the records that say so: chains stay loosely coupled", minimum=10.0
     )
     heading_bias_sigma_deg: float = setting(
         0.5, "degree", "mounting error of the attitude reference", minimum=1e-6
@@ -71,16 +74,16 @@ class GraphSettings(Settings):
 
     @property
     def clock_offset_sigma_m(self) -> float:
-        """How far sound goes in the sigma of a clock's offset."""
+        """The sigma of a clock's offset, as a distance at the speed of sound."""
         return _SOUND_MPS * 1e-3 * self.clock_offset_sigma_ms
 
     @property
     def clock_drift_sigma_m_per_h(self) -> float:
-        """By how many metres an hour that may grow."""
+        """The sigma of a clock's rate, as a distance an hour."""
         return _SOUND_MPS * 3600e-6 * self.clock_drift_sigma_ppm
 
     def start_sigma_at(self, time_s: float) -> float:
-        """Return how uncertain a chain begins that is first heard of, or begun anew, at a time.
+        """Return the position's sigma where a chain is first heard of, or begun anew, at a time.
 
         Starts are known at mission time zero; dead reckoning has run away from them since.
         """

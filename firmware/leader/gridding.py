@@ -1,7 +1,7 @@
 """A decoder's map on a grid: exact on as many nodes as its points can tell apart, cubic between.
 
 A Gaussian process of few points is smooth over a fraction of their spacing, so that on a fine grid
-most of Eq. 5 and 6 would be spent on what the neighbours tell as well.
+Eq. 5 and 6 would mostly be evaluated where interpolation does as well.
 """
 
 import numpy as np

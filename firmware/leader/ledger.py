@@ -95,7 +95,7 @@ class OdometryRecord:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SharedDriftRecord:
-    """Two vehicles in the same water: the biases of two nodes are alike to the sigma."""
+    """Two vehicles in one water: the biases of two nodes agree within the sigma."""
 
     origin: int
     target: int
@@ -104,7 +104,7 @@ class SharedDriftRecord:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SharedWalkRecord:
-    """Two vehicles in the same water: between two times their biases changed alike, to the sigma.
+    """Two vehicles in one water: between two times their biases changed alike, within the sigma.
 
     Keys are of nodes: origins of the two vehicles at the earlier time, targets at the later.
     """
@@ -118,7 +118,8 @@ class SharedWalkRecord:
 class ClosureRecord:
     """A loop closure: position of target minus position of origin (2,), with its covariance.
 
-    It says that both saw the same place, each along its lever, whose difference the offset is.
+    It says that both saw the same place, each along its own lever; the offset is the levers'
+    difference.
     """
 
     origin: Anchor
@@ -145,8 +146,8 @@ def clock_row(time_s: float) -> Array:
 class RangeRecord:
     """A one-way range between two anchors: the third line of Eq. 11.
 
-    The target sent, by a clock that may be behind. A clock's state is by how much that lengthens
-    ranges: in m at mission time zero, and in m/h.
+    The target sent, by a clock that may be behind. A clock's state is how much it lengthens ranges:
+    in m at mission time zero, and in m/h.
     """
 
     origin: Anchor

@@ -12,7 +12,7 @@ from protocol.modems.base import Modem, Reception
 class LeaderLoop:
     """Reads ports, runs the core, writes ports; matches go to the worker.
 
-    stopwatch returns seconds that deadlines are held against; in virtual time it stands still.
+    stopwatch returns the seconds by which deadlines are judged; in virtual time it stands still.
     """
 
     def __init__(

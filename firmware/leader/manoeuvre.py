@@ -2,10 +2,10 @@
 
 A candidate is one vehicle that keeps a heading for a while; all others go on as they do. Along it
 the joint covariance of the vehicles' newest states and of known ground is carried forward: it grows
-by dead reckoning, and shrinks by ranges, as their geometry will be, and by closures with the ground
-that will be crossed, as much as the relief there can tell. No measurement is needed for that, only
-where it will be made: the expected covariance of a linear filter (Davison and Murray, PAMI 2002,
-choose what to look at so).
+by dead reckoning, and shrinks by ranges, according to their geometry then, and by closures with the
+ground on the way, according to its relief. That takes no measurements, only the places where they
+will be made: it is the expected covariance of a linear filter (by which Davison and Murray, PAMI
+2002, choose where to look).
 """
 
 from dataclasses import dataclass
@@ -20,9 +20,9 @@ from protocol.settings import Settings, setting
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ManoeuvreSettings(Settings):
-    """How far one looks ahead, and what is expected there."""
+    """How far ahead candidates are judged, and what is expected there."""
 
-    horizon_s: float = setting(600.0, "s", "a manoeuvre that takes no longer", minimum=60.0)
+    horizon_s: float = setting(600.0, "s", "the length of a manoeuvre", minimum=60.0)
     step_s: float = setting(20.0, "s", "between predicted measurements", minimum=5.0)
     headings: int = setting(16, "", "tried, all around", minimum=4, maximum=72)
     reach_m: float = setting(
@@ -31,7 +31,7 @@ class ManoeuvreSettings(Settings):
     range_sigma_m: float = setting(2.0, "m", "of a predicted range", minimum=0.1)
     closure_floor_m: float = setting(0.4, "m", "no closure tells more", minimum=0.01)
     worth: float = setting(
-        0.8, "1", "of the uncertainty that going on leaves; else nothing is proposed", minimum=0.01
+        0.8, "1", "of the uncertainty without it that a proposed manoeuvre may leave", minimum=0.01
     )
 
 

@@ -1,7 +1,7 @@
 """Whether the map that a closure builds agrees with itself where the match did not look.
 
-The paper rejects invalid closures by the consistency of the map they build (its MCM; the text of
-its reference is not to be had, so this is designed from that description). A closure between two
+The paper rejects invalid closures by the consistency of the map they build (its MCM; the reference
+is not available, so this is designed from the paper's description). A closure between two
 sub-maps moves their neighbours along with it. Where neighbours then overlap, a valid closure lays
 like on like, and an invalid one does not. Each such window votes with a log-likelihood ratio of
 agreement against unrelated seabed, averaged over what dead reckoning leaves open; a flat seabed
@@ -36,10 +36,10 @@ class VoteSettings(Settings):
         2.0, "", "excess over the tolerated misfit that speaks neither for nor against", minimum=1.1
     )
     window_limit: float = setting(
-        6.0, "", "log ratio beyond which one window may not carry the vote", minimum=0.1
+        6.0, "", "most that one window may add to the log ratio", minimum=0.1
     )
     reach_sigmas: float = setting(
-        2.5, "", "of the predicted shift, looked over in every window", minimum=0.5
+        2.5, "", "of the predicted shift, within which each window is searched", minimum=0.5
     )
 
 
@@ -48,8 +48,8 @@ class VoteWindow:
     """Two neighbours of a closure's sub-maps, drift removed, each in its raw dead reckoning.
 
     shift_m (2,) is what the closure says is to be added to the query's coordinates so that it lies
-    on the reference, covariance_m2 (2, 2) of it with the dead reckoning since (`carried`);
-    matching holds the sigmas of what spoils this pair.
+    on the reference; covariance_m2 (2, 2) is its covariance and that of the dead reckoning in
+    between (`carried`); matching holds the sigmas of this pair.
     """
 
     reference: GriddedSubmap

@@ -47,7 +47,7 @@ class MatchJob:
 
     @property
     def prior_radius_m(self) -> float:
-        """That of a circle as large as the ellipse of one sigma in which the offset was sought."""
+        """The radius of the circle whose area equals the prior's one-sigma ellipse."""
         return float(max(np.linalg.det(self.prior_covariance_m2), 0.0) ** 0.25)
 
     def run(self) -> MatchOutcome:
@@ -134,7 +134,7 @@ def jobs_again(
     settings: ClosureSettings,
     calibrations: Calibrations,
 ) -> list[MatchJob]:
-    """Return the matches of a sheet's open pairs whose offset others have told much better by now.
+    """Return the matches of a sheet's open pairs whose offset is known much better by now.
 
     partners come with the radius at the last look and the number of the hint that a look has left,
     if any: what the pair itself told is taken out of what is known, lest it confirm itself. Raises
@@ -197,7 +197,7 @@ def _ranked(
 
 
 def _worth_trying(ranked: list[Offset], settings: ClosureSettings) -> list[Offset]:
-    """Return the first of the ranked pairs, but few whose offset is known before the match."""
+    """Return the first of the ranked pairs, few of them with an offset known already."""
     chosen, known = [], 0
     for offset in ranked:
         is_known = offset.sigma_m <= settings.known_sigma_m
@@ -224,7 +224,7 @@ def _jobs(
     *,
     have_hints: Set[SheetId] | None = None,
 ) -> list[MatchJob]:
-    """Return the matches of a sheet with those that it lies to as given.
+    """Return the matches of a sheet with others, given its offsets from them.
 
     Pairs looked at for the second time come with have_hints: those of which no hint is asked.
     """

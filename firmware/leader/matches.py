@@ -32,7 +32,7 @@ class MatchingSettings(Settings):
         minimum=0.0,
     )
     hint_overlap_m2: float = setting(
-        4000.0, "m^2", "the same for a hint, which chooses no ripple", minimum=0.0
+        4000.0, "m^2", "the same for a hint, which does not choose among ripples", minimum=0.0
     )
     search_sigmas: float = setting(3.0, "", "99 % of the prior's mass", minimum=1.0)
     search_cap_m: float = setting(200.0, "m", "beyond it sub-maps do not meet", minimum=1.0)
@@ -97,7 +97,7 @@ class MatchingSettings(Settings):
         2.5, "1", "of a hint's covariance: neighbouring pairs share soundings", minimum=1.0
     )
     hint_floor_m: float = setting(
-        3.0, "m", "nearer than so an ambiguous pair places nothing", minimum=0.0
+        3.0, "m", "least sigma of a hint: an ambiguous pair places nothing better", minimum=0.0
     )
     hint_gain: float = setting(
         0.5, "", "share of the prior's variance that a hint must leave along some axis", minimum=0.0

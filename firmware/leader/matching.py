@@ -182,7 +182,7 @@ def _refine_best(
 def _starts(
     surface: ErrorSurface, found: ambiguity.Posterior, settings: MatchingSettings, cell_m: float
 ) -> list[Array]:
-    """Return the best of the best lattice shifts, no two of them neighbours."""
+    """Return the best lattice shifts, no two of them neighbours."""
     flat = found.mass.ravel()
     count = min(settings.candidates, flat.size)
     order = np.argpartition(flat, -count)[-count:]
@@ -210,10 +210,10 @@ def _decide(
 ) -> MatchOutcome:
     """Return the winner as a closure in the plane or along one axis, or the gate it failed.
 
-    ridge is the screened surface, and the misfit up to which a shift of it fits.
+    ridge is the screened surface, and the largest misfit that still counts as a fit.
 
-    Mass that is certain where neither the slopes nor the prior can be is a contradiction: chance
-    has chosen among repetitions of a pattern.
+    Where the mass is certain though neither the slopes nor the prior can be, chance has chosen
+    among the repetitions of a pattern: such a pair counts as ambiguous.
     """
     settings, refined = problem.settings, measure(winner.field, problem.noise)
     residual, _, _ = problem.error_at(refined.shift_m, absolute=settings.residual == "absolute")

@@ -2,9 +2,9 @@
 
 Ranges tell how far vehicles are apart, not where they are nor how they are turned about each other;
 closures tell where on the map a vehicle is, not where the map is. Each quantity below is a linear
-form of the vehicles' newest states; what measurements tell of it shows in its sigma with them over
-that without. The generalised eigenvalues of the two covariances say the same without names: an
-eigenvalue near one is a direction in which nothing was learned.
+form of the vehicles' newest states; the ratio of its sigmas, with measurements and without, shows
+how much they tell of it. The generalised eigenvalues of the two covariances say the same without
+names: an eigenvalue near one is a direction in which nothing was learned.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Where sheets lie by the estimate, and how one lies to others before any match has told."""
+"""Where sheets lie by the estimate, and their offsets from each other before any match."""
 
 import contextlib
 from dataclasses import dataclass, replace
@@ -19,9 +19,9 @@ _TINY_M2 = 1e-6  # two sub-maps of one node have no offset
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Offset:
-    """How a sheet lies to another one, the origin.
+    """The offset of a sheet from another one, the origin, as the estimate has it.
 
-    shift_m (2,) is to be added to what dead reckoning says, each sheet's at its own time;
+    shift_m (2,) is to be added to the offset by dead reckoning, each sheet's at its own time;
     covariance_m2 (2, 2) is that of the offset. drifts are those at the nodes of both.
     """
 
@@ -50,7 +50,7 @@ class Offset:
 
 
 def offsets_of(sheet: Sheet, others: list[Sheet], estimate: Estimate) -> list[Offset]:
-    """Return how a sheet lies to others.
+    """Return the offsets of a sheet from others.
 
     Those that hang on no node are left out: frames were lost there. Raises EstimationError if the
     sheet itself hangs on none.

@@ -29,7 +29,7 @@ Ends = tuple[tuple[int, float], ...]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OpenPair:
-    """Where the offset was sought at the last look, and the hint that a look left, if any."""
+    """The radius of the search at the last look, and the hint that a look left, if any."""
 
     radius_m: float
     hint: int | None = None
@@ -37,7 +37,7 @@ class OpenPair:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Heard:
-    """A hint that was entered, and what sub-maps told it."""
+    """A hint that was entered, and the sub-maps that it comes from."""
 
     number: int
     ends: Ends
@@ -53,7 +53,7 @@ class OpenPairs:
         self._hints: deque[_Heard] = deque(maxlen=_HEARD)
 
     def note(self, job: MatchJob, outcome: MatchOutcome) -> None:
-        """Remember a pair that a match left open, forget one that is none; a closure settles it."""
+        """Remember a pair that a match left open; forget one that failed otherwise."""
         pairs = self._of.get(job.target.id, {})
         if outcome.reason in _OPEN:
             known = pairs.get(job.origin.id, OpenPair(radius_m=job.prior_radius_m))

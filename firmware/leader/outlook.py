@@ -32,7 +32,7 @@ _VELOCITY_OVER_S = 20.0
 class Outlook:
     """What can be said of the newest states of all vehicles, and of how to know them better.
 
-    Remarks only: what keeps them from being made stops neither a composition nor a record.
+    These are remarks only: where one cannot be made, compositions and records go on without it.
     """
 
     def __init__(

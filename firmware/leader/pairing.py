@@ -53,10 +53,10 @@ def side_of(sheet: Sheet, trajectory: Trajectory) -> Side:
 
 
 def strain_m(origin: Side, target: Side, drift_m2ps2: Array) -> float:
-    """Return how far cells of two sides may lie apart by drift that is known to (4, 4) only.
+    """Return how far drift of a covariance (4, 4) may lay cells of two sides apart.
 
-    Where lines of opposite heading lie side by side old cells meet young ones. It is a root mean
-    square, of each axis.
+    Where lines of opposite heading lie side by side, old cells meet young ones. It is the root mean
+    square along each axis.
     """
     alike = float(origin.starboard @ target.starboard)
     own = np.trace(drift_m2ps2) / 2.0

@@ -39,7 +39,7 @@ _STEADY_M_PER_H = 0.01  # of a clock whose rate is not asked for
 
 
 class PoseGraph(Estimate):
-    """Every vehicle's trajectory, and what ties them together: an estimate that is told."""
+    """Every vehicle's trajectory, and what ties them together: an estimate, and what it is told."""
 
     def __init__(self, settings: GraphSettings) -> None:
         super().__init__(settings)

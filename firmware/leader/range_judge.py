@@ -48,20 +48,26 @@ class RangeSettings(Settings):
         0.2, "1", "share of outliers before any were seen", minimum=0.01, maximum=0.99
     )
     window_spread_m: float = setting(
-        1.3, "m", "relative dead reckoning over 20 s; it grows with the root", minimum=0.0
+        1.3,
+        "m",
+        "error of relative dead reckoning over 20 s; it grows with the root of time",
+        minimum=0.0,
     )
     rate_sigma_mps: float = setting(
         0.15, "m/s", "relative drift along the line of sight that is not known yet", minimum=1e-3
     )
     lost_share: float = setting(
-        0.02, "1", "of belief that the estimate is astray", minimum=1e-6, maximum=0.5
+        0.02, "1", "prior probability that the estimate is astray", minimum=1e-6, maximum=0.5
     )
-    lost_m: float = setting(50.0, "m", "how far predictions miss then", minimum=1.0)
+    lost_m: float = setting(50.0, "m", "by how much predictions then miss", minimum=1.0)
     joined: int = setting(
-        20, "ranges", "of windows that join while they are not understood", minimum=5
+        20, "ranges", "at most in windows that are joined while they are undecided", minimum=5
     )
     joined_s: float = setting(
-        60.0, "s", "for which drift along the line of sight is a steady rate", minimum=0.0
+        60.0,
+        "s",
+        "of joined windows at most: drift along the line of sight keeps a steady rate",
+        minimum=0.0,
     )
     shortest_m: float = setting(5.0, "m", "nearer, the direction says nothing", minimum=0.0)
     longest_m: float = setting(
@@ -71,17 +77,20 @@ class RangeSettings(Settings):
         256, "ranges", "waiting for their sender's track: two minutes of four followers", minimum=16
     )
     bent_m: float = setting(
-        0.5, "m", "bend of a range that hides in its noise (1 m, Eq. 13)", minimum=0.01
+        0.5, "m", "a bend that a range's noise hides (1 m, Eq. 13)", minimum=0.01
     )
     bent_share: float = setting(
-        0.02, "1", "of a range: up to such a bend, a sixth of it aside, it is used roughly",
-        minimum=0.0, maximum=1.0,
-    )  # fmt: skip
+        0.02,
+        "1",
+        "largest bend over range at which it is used (a sigma of a sixth of it to the side)",
+        minimum=0.0,
+        maximum=1.0,
+    )
     bent_alike: float = setting(
-        2.0, "1", "by which bends count more than noise: two minutes of windows bend alike",
+        2.0, "1", "weight of a bend over noise: the windows of two minutes all bend alike",
         minimum=1.0,
     )  # fmt: skip
-    waiting: int = setting(64, "windows", "of 20 s that wait until they are understood", minimum=1)
+    waiting: int = setting(64, "windows", "of 20 s that wait to be decided", minimum=1)
     certainty: float = setting(
         0.995, "1", "share of belief that one explanation must have", minimum=0.5, maximum=1.0
     )

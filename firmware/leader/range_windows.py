@@ -33,7 +33,7 @@ class _HeldRange:
 class _PlacedRange:
     """A slant range between two anchors of the graph, and the horizontal one that it predicts.
 
-    clock_m of it are the sender's clock's, as far as that is known.
+    clock_m of it are due to the sender's clock, as far as that is known.
     """
 
     sender: int
@@ -49,10 +49,10 @@ class _PlacedRange:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _BelievedRange:
-    """A range for the graph: horizontal, but for what the sender's clock adds.
+    """A range for the graph: horizontal, except for what the sender's clock adds.
 
-    Steepness is depth over distance: by so much, in quadrature, noise and a depth that is wrong
-    count for more across than along the slant.
+    Steepness is the difference in depth over the horizontal distance: the slant adds, in
+    quadrature, the sigma of a range times its steepness.
     """
 
     placed: _PlacedRange
@@ -63,7 +63,7 @@ class _BelievedRange:
 
 @dataclass(slots=True)
 class _Window:
-    """Ranges that are judged together, and what was entered of them while they were too bent."""
+    """Ranges judged together, and the records entered for them while they bend too much."""
 
     held: list[_HeldRange]
     entered: list[int] = field(default_factory=list)  # numbers of the ledger
@@ -197,9 +197,10 @@ class Ranging:
     def _enter(self, window: _Window, placed: list[_PlacedRange], graph: PoseGraph) -> _Fate:
         """Enter what can be believed of a window, unless it has to wait.
 
-        One whose bend does not hide in its noise is entered as roughly as it bends, and anew once
-        it bends half as much; that verdict rests on the first one to a small part. What was
-        composed with other ranges meanwhile stays as it is.
+        A window whose bend its noise does not hide is entered with a sigma that grows with the
+        bend, and anew once it bends half as much; the new verdict rests on the first to a small
+        part. Records
+        that were composed with others meanwhile stay as they are.
         """
         if not all(number in graph for number in window.entered):
             self.counters["ranges_left_rough"] += len(placed)

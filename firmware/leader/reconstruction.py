@@ -2,9 +2,9 @@
 
 Source: paper, section 4.2: Gaussian process regression (Eq. 5, 6) inside the outer edges of the
 points' Delaunay triangulation; depths with a variance above 0.1 are dropped. That is the map's own
-variance, without sigma^2 of the soundings as far as noise may explain it: else nothing were left of
-a survey from 100 m above the seabed. A lattice tells one variance, that of soundings about it all,
-and nothing of it is dropped.
+variance, without sigma^2 of the soundings as far as noise may explain it: otherwise nothing would
+be left of a survey from 100 m above the seabed. A lattice carries a single variance, that of the
+soundings about it, and none of its depths are dropped.
 """
 
 from collections.abc import Mapping
@@ -48,7 +48,7 @@ class ReconstructionSettings(Settings):
     max_noise_m2: float = setting(
         1.0,
         "m2",
-        "of soundings, 100 to 200 m deep; what is more, a fit could not follow",
+        "of soundings at 100 to 200 m of depth; what exceeds it is relief that no fit could follow",
         minimum=0.0,
     )
     max_cells: int = setting(

@@ -41,8 +41,10 @@ class LeaderSettings(Settings):
     ranges: RangeSettings = setting(RangeSettings, "", "one-way travel times")
     graph: GraphSettings = setting(GraphSettings, "", "the pose graph")
     composition: CompositionSettings = setting(CompositionSettings, "", "the graph's past")
-    coverage: CoverageSettings = setting(CoverageSettings, "", "which sub-maps are matched with")
-    manoeuvre: ManoeuvreSettings = setting(ManoeuvreSettings, "", "what is proposed to do")
+    coverage: CoverageSettings = setting(
+        CoverageSettings, "", "which old sub-maps are still matched with"
+    )
+    manoeuvre: ManoeuvreSettings = setting(ManoeuvreSettings, "", "which manoeuvres are proposed")
     fixes: FixSettings = setting(FixSettings, "", "GNSS and USBL")
     fleet: FleetSettings = setting(FleetSettings, "", "the followers' trajectories")
     answers: str = setting(
@@ -64,7 +66,7 @@ class LeaderSettings(Settings):
 
 
 def reassembly_of(settings: LeaderSettings, slots: Slots) -> ReassemblySettings:
-    """Return the reassembly's settings as the raster of the air asks for.
+    """Return the reassembly's settings as the slots of the air require.
 
     Many followers need room, and take long to send a sub-map; where they have air for repeats, it
     waits for those.

@@ -20,7 +20,7 @@ class Shelf(Protocol):
         """Return a body, or None if it is lost."""
 
     def drop(self, name: str) -> None:
-        """Keep a body no longer, if there is one."""
+        """Drop a body, if there is one."""
 
 
 class MemoryShelf:

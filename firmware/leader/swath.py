@@ -2,7 +2,7 @@
 
 A roll bias tilts every swath about its track, a wrong sound speed bends it (the refraction smile):
 depths err by roll * y + smile * y^2 / W at the across-track distance y of a swath of half width W.
-Both belong to a vehicle and last, whatever line it is on.
+Both belong to a vehicle, and are the same on all of its lines.
 """
 
 import dataclasses

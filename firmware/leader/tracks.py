@@ -40,7 +40,7 @@ class TrackBuffer:
     def is_plausible(
         self, time_s: float, north_m: float, east_m: float, fastest_mps: float
     ) -> bool:
-        """Return whether a vehicle so fast can have been there, given the states next in time."""
+        """Return whether a vehicle so fast can have been there, by its states around that time."""
         here = round(4.0 * time_s)
         near = range(1, 4 * _NEIGHBOURS_S + 1)
         before = next((here - k for k in near if here - k in self._states), self._newest)
@@ -69,7 +69,7 @@ class TrackBuffer:
     def settle(self, before_s: float) -> None:
         """Forget which states before a time are known: none of them will come again.
 
-        The newest is kept, however old: after a long silence the next one is held against it.
+        The newest is kept, however old: after a long silence the next one is checked against it.
         """
         self.track()
         self._states = {

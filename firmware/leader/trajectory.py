@@ -94,7 +94,7 @@ class Trajectory:
         )
 
     def _around(self, time_s: Array) -> slice:
-        """Return the nodes that times are interpolated between: few of a day's."""
+        """Return the nodes between which times are interpolated: few of a whole day."""
         if not time_s.size:
             return slice(None)
         first = int(np.searchsorted(self.time_s, time_s.min(), side="right")) - 1

@@ -46,7 +46,7 @@ class DriftChange:
 def reckoned_m2(
     duration_s: float, noise: float, walk: float, *, start_m: float = 0.0, drift_mps: float = 0.0
 ) -> float:
-    """Return the variance, each axis, of dead reckoning after so long alone.
+    """Return the variance, each axis, of dead reckoning that nothing corrects for a time.
 
     start_m and drift_mps are the sigmas of position and drift when it began.
     """
@@ -88,10 +88,10 @@ def likely_walk(changes: Sequence[DriftChange], believed: float, factor: float) 
     """Return the walk in m/s/sqrt(s) that an estimate's changes of drift speak for.
 
     What the estimate expected is taken out of what it found; what is left was measured. Successive
-    changes are taken for independent, which neighbours are not quite. Before any evidence the walk
-    is log-normal, may well be wrong by the factor, and has the believed one as the root of its mean
-    square. So has the answer, over what remains likely: little evidence leaves more room for drift
-    rather than less.
+    changes are taken for independent, which neighbours are not quite. The walk's prior is
+    log-normal: the factor is its one-sigma spread, the believed walk its root mean square. The
+    answer is the root mean square of the posterior, so that little evidence leaves more room for
+    drift rather than less.
     """
     walks = believed * np.geomspace(1 / _REACH, _REACH, _GRID)
     spread = np.log(factor)

@@ -34,6 +34,19 @@ COVARIANCES_AT_ONCE = 16
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Mission:
+    """What a mission was, wherever its nodes ran: its settings, its vehicles, and the truth."""
+
+    settings: MissionSettings
+    site: Site
+    seed: int
+    vehicles: Sequence[SimulatedVehicle]
+    deliveries: Sequence[Delivery]
+    truth_map: DepthMap
+    baseline: str = "none"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LeaderRecord:
     """What the leader holds at the end: trajectories by vehicle, closures, and its sheets.
 
@@ -86,64 +99,46 @@ def seabed_remarks(counters: Counters) -> list[str]:
 
 
 def mission_result(
-    settings: MissionSettings,
-    site: Site,
-    seed: int,
-    baseline: str,
-    vehicles: Sequence[SimulatedVehicle],
-    leader: LeaderNode,
-    followers: Sequence[FollowerNode],
-    deliveries: Sequence[Delivery],
-    truth_map: DepthMap,
+    mission: Mission, leader: LeaderNode, followers: Sequence[FollowerNode]
 ) -> MissionResult:
     """Return what a mission in this process came to, as the leader sees it at the end."""
+    time_s = mission.vehicles[0].true_track().time_s
     return result_of_record(
-        settings,
-        site,
-        seed,
-        baseline,
-        vehicles,
+        mission,
         [leader.log.columns(), *(node.log.columns() for node in followers)],
-        leader_record(leader.core, vehicles[0].true_track().time_s, site.window),
+        leader_record(leader.core, time_s, mission.site.window),
         {
             "leader": leader.core.status(),
             **{f"follower_{node.core.vehicle}": node.core.status() for node in followers},
         },
-        deliveries,
-        truth_map,
     )
 
 
 def result_of_record(
-    settings: MissionSettings,
-    site: Site,
-    seed: int,
-    baseline: str,
-    vehicles: Sequence[SimulatedVehicle],
+    mission: Mission,
     beliefs: Sequence[Mapping[str, Array]],
     record: LeaderRecord,
     counters: Mapping[str, Counters],
-    deliveries: Sequence[Delivery],
-    truth_map: DepthMap,
 ) -> MissionResult:
     """Return what a mission came to, from each vehicle's beliefs and the leader's record."""
+    settings = mission.settings
     return MissionResult(
         scenario=settings.scenario,
-        site=site,
-        seed=seed,
+        site=mission.site,
+        seed=mission.seed,
         profile=settings.follower.profile,
-        baseline=baseline,
+        baseline=mission.baseline,
         vehicles=[
             vehicle_result(vehicle, columns, record)
-            for vehicle, columns in zip(vehicles, beliefs, strict=True)
+            for vehicle, columns in zip(mission.vehicles, beliefs, strict=True)
         ],
         closures=record.closures,
-        deliveries=deliveries,
+        deliveries=mission.deliveries,
         patches=record.patches,
-        truth_map=truth_map,
+        truth_map=mission.truth_map,
         counters=counters,
         quantities=record.quantities,
-        remarks=[*site.raster.remarks, *record.remarks],
+        remarks=[*mission.site.raster.remarks, *record.remarks],
         settings={key: value for key, value, *_ in flatten(settings)},
     )
 

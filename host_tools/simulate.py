@@ -8,7 +8,7 @@ from typing import Never
 from tqdm import tqdm
 
 from host_tools.baselines import Unheard
-from host_tools.collect import mission_result
+from host_tools.collect import Mission, mission_result
 from host_tools.commands import Command, add_mission_arguments, settings_of
 from host_tools.evaluation import Evaluation, evaluate
 from host_tools.mapping import DepthMap
@@ -55,9 +55,16 @@ def simulate(
         progress=progress,
     )
     close_stores([leader, *followers])
-    return mission_result(
-        settings, site, seed, baseline, vehicles, leader, followers, deliveries, truth_map
+    mission = Mission(
+        settings=settings,
+        site=site,
+        seed=seed,
+        baseline=baseline,
+        vehicles=vehicles,
+        deliveries=deliveries,
+        truth_map=truth_map,
     )
+    return mission_result(mission, leader, followers)
 
 
 def outcome_lines(evaluation: Evaluation) -> list[str]:

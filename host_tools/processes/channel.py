@@ -9,7 +9,7 @@ from typing import Never
 
 from tqdm import tqdm
 
-from host_tools.collect import result_of_record
+from host_tools.collect import Mission, result_of_record
 from host_tools.commands import Command
 from host_tools.evaluation import evaluate
 from host_tools.mapping import DepthMap
@@ -95,16 +95,17 @@ def _result(
     for each in files.values():
         each.add_soundings(truth_map)
     return result_of_record(
-        voyage.settings,
-        voyage.site,
-        voyage.seed,
-        "none",
-        vehicles,
+        Mission(
+            settings=voyage.settings,
+            site=voyage.site,
+            seed=voyage.seed,
+            vehicles=vehicles,
+            deliveries=deliveries,
+            truth_map=truth_map,
+        ),
         [files[v.index].beliefs(v.true_track().time_s) for v in vehicles],
         files[0].record(),
         {**{each.name: each.counters() for each in files.values()}, **lines},
-        deliveries,
-        truth_map,
     )
 
 

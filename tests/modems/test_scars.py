@@ -55,36 +55,49 @@ def pass_one_frame(rig: Rig) -> None:
     assert b"still alive" in frames_of(rig, 2)
 
 
+UNREADABLE = [
+    nmea.encode("CARXD", 1, 2, 0, 1, "0G"),
+    nmea.encode("CARXD", 1, 2, 0, 1, "000"),
+    nmea.encode("CARXD"),
+    nmea.encode("CARDP", 1, 2, 1, 0, 0, ";;;;", "1;two;xx;1"),
+    nmea.encode("CACST"),
+    nmea.encode("CACST", "x", "", ""),
+    nmea.encode("CAMUA", 1, 2, "XYZ"),
+]
+MEANINGLESS = [
+    nmea.encode("CARXD", "one", 2, 0, 1, "00"),
+    nmea.encode("CACST", 0, "999999.9", "nine"),
+    nmea.encode("CADRQ", "", "", "", "", "", "x"),
+    nmea.encode("CADRQ", 0, 2, 0, 0, 256, 999999),
+    nmea.encode("CAREV", "", "INIT"),
+    nmea.encode("CAREV", "", "AUV", "a.b.c"),
+    nmea.encode("CAMPR", 1, 2, "-1"),
+    nmea.encode("CAACK", 2, 1, -5, 1),
+    nmea.encode("CATMQ", "yesterday"),
+    nmea.encode("CAERR"),
+    nmea.encode("CAXST", *("",) * 20),
+]
+DAMAGED = [b"$CARXD,1,2,0,1,00*00\r\n", b"\xff\xfe$$$***,,,\r\n" * 50]
+
+
 @pytest.mark.parametrize(
-    "line",
+    ("line", "counter"),
     [
-        nmea.encode("CARXD", 1, 2, 0, 1, "0G"),
-        nmea.encode("CARXD", 1, 2, 0, 1, "000"),
-        nmea.encode("CARXD", "one", 2, 0, 1, "00"),
-        nmea.encode("CARXD"),
-        nmea.encode("CARDP", 1, 2, 1, 0, 0, ";;;;", "1;two;xx;1"),
-        nmea.encode("CACST"),
-        nmea.encode("CACST", "x", "", ""),
-        nmea.encode("CACST", 0, "999999.9", "nine"),
-        nmea.encode("CADRQ", "", "", "", "", "", "x"),
-        nmea.encode("CADRQ", 0, 2, 0, 0, 256, 999999),
-        nmea.encode("CAREV", "", "INIT"),
-        nmea.encode("CAREV", "", "AUV", "a.b.c"),
-        nmea.encode("CAMUA", 1, 2, "XYZ"),
-        nmea.encode("CAMPR", 1, 2, "-1"),
-        nmea.encode("CAACK", 2, 1, -5, 1),
-        nmea.encode("CATMQ", "yesterday"),
-        nmea.encode("CAERR"),
-        nmea.encode("CAXST", *("",) * 20),
-        b"$CARXD,1,2,0,1,00*00\r\n",
-        b"\xff\xfe$$$***,,,\r\n" * 50,
+        *((line, "undecodable") for line in UNREADABLE),
+        *((line, "lines") for line in MEANINGLESS),
+        *((line, "damaged_lines") for line in DAMAGED),
     ],
 )
-def test_one_undecodable_line_neither_kills_nor_hangs_the_driver(line: bytes) -> None:
+def test_one_undecodable_line_is_counted_and_neither_kills_nor_hangs_the_driver(
+    line: bytes, counter: str
+) -> None:
     """Goby3 issues 283 and 224."""
     rig = micro_rig()
-    rig.cores[2].receive_data(line, rig.now_s)
-    rig.cores[2].poll(rig.now_s)
+    core = rig.cores[2]
+    before = core.status()[counter]
+    core.receive_data(line, rig.now_s)
+    core.poll(rig.now_s)
+    assert core.status()[counter] == before + line.count(b"\n")
     pass_one_frame(rig)
 
 

@@ -15,10 +15,8 @@ from firmware.compression.losses import loss_patterns
 from firmware.compression.steps import run
 from tests.compression.conftest import relief_m
 
-RNG = np.random.default_rng(5)
-CELLS_M = RNG.uniform(-30.0, 30.0, (500, 2))
+CELLS_M, POINTS_M = np.split(np.random.default_rng(5).uniform(-30.0, 30.0, (540, 2)), [500])
 DEPTH_M = relief_m(*CELLS_M.T) - 40.0
-POINTS_M = RNG.uniform(-30.0, 30.0, (40, 2))
 FRAGMENT = dealt_fragments(POINTS_M, 10)
 
 
@@ -32,7 +30,7 @@ def objective(kernel: Kernel, loss: float) -> ExpectedError:
 def test_gradient_of_the_expected_error_is_that_of_differences(kernel: Kernel, loss: float) -> None:
     problem, log_b = objective(kernel, loss), float(np.log(1.0 / 6.0))
     found = problem.evaluate(POINTS_M, log_b)
-    turn = RNG.normal(size=POINTS_M.shape) * 0.02
+    turn = np.random.default_rng(7).normal(size=POINTS_M.shape) * 0.02
     ahead, behind = (problem.evaluate(POINTS_M + s * turn, log_b).error_m2 for s in (1.0, -1.0))
     slope = float(np.sum(turn * found.by_position))
     assert (ahead - behind) / 2.0 == pytest.approx(slope, rel=0.05, abs=1e-7)
@@ -60,8 +58,8 @@ def test_expected_error_is_the_mean_over_all_patterns_of_the_decoder_itself() ->
 
 @pytest.mark.parametrize("kernel", list(Kernel))
 def test_points_beyond_the_kernels_reach_hardly_change_the_error(kernel: Kernel) -> None:
-    cells_m = RNG.uniform(0.0, 1.0, (2000, 2)) * np.array([30.0, 600.0])
-    points_m = RNG.uniform(0.0, 1.0, (200, 2)) * np.array([30.0, 600.0])
+    rng = np.random.default_rng(8)
+    cells_m, points_m = (rng.uniform([0.0, 0.0], [30.0, 600.0], (n, 2)) for n in (2000, 200))
     points_m = points_m[np.argsort(points_m[:, 1])]
     depth_m = relief_m(*cells_m.T) - 40.0
     none = loss_patterns(0.0, 10)
@@ -95,7 +93,7 @@ def test_fitc_likelihood_is_that_of_the_dense_covariance(kernel: Kernel) -> None
             moved = dataclasses.replace(parameters, **{name: getattr(parameters, name) + step})
             values.append(run(problem.steps(moved)).value)
         assert (values[0] - values[1]) / 2e-3 == pytest.approx(slope, rel=1e-3, abs=1e-6)
-    turn = RNG.normal(size=POINTS_M.shape) * 1e-3
+    turn = np.random.default_rng(9).normal(size=POINTS_M.shape) * 1e-3
     values = [
         run(problem.steps(dataclasses.replace(parameters, point_m=POINTS_M + s * turn))).value
         for s in (1.0, -1.0)

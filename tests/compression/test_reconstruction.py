@@ -26,8 +26,7 @@ from protocol.errors import EstimationError
 from protocol.packets import Header, Profile, SubmapFragment
 from tests.compression.conftest import Survey, made_survey, relief_m
 
-RNG = np.random.default_rng(3)
-PLACES_M = RNG.uniform([-40.0, -70.0], [40.0, 70.0], (150, 2))
+PLACES_M = np.random.default_rng(3).uniform([-40.0, -70.0], [40.0, 70.0], (150, 2))
 POINTS = np.column_stack([PLACES_M, relief_m(*PLACES_M.T)])
 TRACK = Track(
     time_s=np.arange(40.0),

@@ -17,11 +17,10 @@ from firmware.leader.matches import MatchOutcome, NoMatch
 from firmware.leader.shelf import MemoryShelf, packed, unpacked
 from firmware.submaps import GriddedSubmap, Track
 
-RNG = np.random.default_rng(5)
 
-
-def grid_at(north_m: float) -> GriddedSubmap:
-    depth_m = RNG.normal(50.0, 2.0, (40, 70))
+def grid_at(north_m: float, seed: int) -> GriddedSubmap:
+    rng = np.random.default_rng(seed)
+    depth_m = rng.normal(50.0, 2.0, (40, 70))
     depth_m[:3] = np.nan
     known = np.isfinite(depth_m)
     return GriddedSubmap(
@@ -30,7 +29,7 @@ def grid_at(north_m: float) -> GriddedSubmap:
         cell_m=2.0,
         depth_m=depth_m,
         variance_m2=np.where(known, 0.01, np.nan),
-        time_s=np.where(known, 86_000.0 + RNG.uniform(0, 40, depth_m.shape), np.nan),
+        time_s=np.where(known, 86_000.0 + rng.uniform(0, 40, depth_m.shape), np.nan),
     )
 
 
@@ -40,7 +39,7 @@ def sheet_at(north_m: float, submap: int) -> Sheet:
     sheet = sheet_of(
         SheetId(vehicle=0, boot_epoch=0, submap=submap),
         track,
-        grid_at(north_m),
+        grid_at(north_m, seed=submap),
         reconstructed=False,
     )
     assert sheet is not None
@@ -70,7 +69,7 @@ def closure_at(time_s: float, axis_deg: float | None) -> Closure:
 
 
 def test_packed_grid_reads_back_to_tenths_of_a_millimetre() -> None:
-    grid = grid_at(1234.5)
+    grid = grid_at(1234.5, seed=5)
     body = packed(grid)
     back = unpacked(body)
     assert (back.north0_m, back.east0_m, back.cell_m) == (1234.5, -70.0, 2.0)

@@ -9,6 +9,7 @@ What is wrong with a store never stops a mission: a file that cannot be used is 
 another name, and one that cannot be written is counted while the mission goes on in memory.
 """
 
+import contextlib
 import logging
 import sqlite3
 import zlib
@@ -130,9 +131,13 @@ class Journal:
             self.counters["store_checkpoints_put_off"] += 1
 
     def checkpointed(self) -> bytes | None:
-        """Return the newest checkpoint, or None."""
-        packed = self._file.checkpoint()
-        return None if packed is None else zlib.decompress(packed)
+        """Return the newest checkpoint, or None.
+
+        Raises StoreUnusableError if it can be read no longer.
+        """
+        with _reading():
+            packed = self._file.checkpoint()
+            return None if packed is None else zlib.decompress(packed)
 
     def put(self, name: str, body: bytes) -> bool:
         """Put away what is wanted seldom; return whether the disk took it: if not, counted."""
@@ -151,22 +156,29 @@ class Journal:
             self.counters["store_shelf_stuck"] += 1
 
     def get(self, name: str) -> bytes | None:
-        """Return what was put away under a name, or None."""
-        return self._file.get(name)
+        """Return what was put away under a name, or None, counted, if it can be had no more."""
+        try:
+            body = self._file.get(name)
+        except sqlite3.Error:
+            body = None
+        if body is None:
+            self.counters["store_shelf_unread"] += 1
+        return body
 
     def replay(self) -> Iterator[tuple[int, bytes]]:
         """Yield kind and body of every input since the checkpoint, in order.
 
         The store knows when this is not run to its end; after REPLAYS_TRIED such times it is
-        set aside.
+        set aside. Raises StoreUnusableError for what can be read no longer.
         """
         if not self._file.is_open:
             return
-        tried = int(self._file.about("replays", "0"))
-        self._file.tell("replays", str(tried + 1))
-        for packed in self._file.inputs():
-            yield from _split(zlib.decompress(packed))
-        self._file.tell("replays", "0")
+        with _reading():
+            tried = int(self._file.about("replays", "0"))
+            self._file.tell("replays", str(tried + 1))
+            for packed in self._file.inputs():
+                yield from _split(zlib.decompress(packed))
+            self._file.tell("replays", "0")
 
     def start(self, text: str) -> str:
         """Return what the vehicle was started from: the text, unless the store knows better."""
@@ -211,19 +223,19 @@ class Journal:
     def _resume(self) -> None:
         """Take an existing file, after reading all of it against its checksums."""
         self._file.open()
-        vehicle = int(self._file.about("vehicle", "-1"))
+        vehicle = int(self._file.about("vehicle"))
         if vehicle != self._owner.vehicle:
             raise ConfigError(
                 f"{self._file.path} is the store of vehicle {vehicle}, not of "
                 f"{self._owner.vehicle}; give each vehicle a folder of its own"
             )
-        if self._file.about("fingerprint", "") != self._owner.fingerprint:
+        if self._file.about("fingerprint") != self._owner.fingerprint:
             raise StoreUnusableError("it is of another mission, configuration or version")
         if int(self._file.about("replays", "0")) >= REPLAYS_TRIED:
             raise StoreUnusableError(f"its replay ended the process {REPLAYS_TRIED} times")
-        self.boot_epoch = int(self._file.about("epoch", "0"))
+        self.boot_epoch = int(self._file.about("epoch"))
         self._number = self._file.verified()
-        self._is_resumed = bool(self._file.about("start", ""))
+        self._is_resumed = bool(self._file.about("start", None if self._number else ""))
 
     def _begin_after(self, why: str) -> None:
         aside = self._file.set_aside()
@@ -294,6 +306,15 @@ class Journal:
     def _close(self) -> None:
         self._file.close()
         self._waiting, self._full, self._checkpoint = [], deque(), None
+
+
+@contextlib.contextmanager
+def _reading() -> Iterator[None]:
+    """Let a store that can be read no longer be one that cannot be used."""
+    try:
+        yield
+    except (sqlite3.Error, zlib.error) as error:
+        raise StoreUnusableError(str(error)) from error
 
 
 def _split(data: bytes) -> Iterator[tuple[int, bytes]]:

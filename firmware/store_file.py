@@ -12,13 +12,13 @@ from typing import Any
 
 from protocol.errors import ConfigError, FathomError
 
-SCHEMA = "2"
+SCHEMA = "3"
 _TABLES = """
-CREATE TABLE about (name TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE about (name TEXT PRIMARY KEY, checksum INTEGER NOT NULL, value TEXT NOT NULL);
 CREATE TABLE inputs (number INTEGER PRIMARY KEY, checksum INTEGER NOT NULL, body BLOB NOT NULL);
 CREATE TABLE checkpoint (one INTEGER PRIMARY KEY CHECK (one = 1), after INTEGER NOT NULL,
                          checksum INTEGER NOT NULL, body BLOB NOT NULL);
-CREATE TABLE shelf (name TEXT PRIMARY KEY, body BLOB NOT NULL)
+CREATE TABLE shelf (name TEXT PRIMARY KEY, checksum INTEGER NOT NULL, body BLOB NOT NULL)
 """
 
 
@@ -41,31 +41,36 @@ class StoreFile:
     def create(self, about: Mapping[str, str]) -> None:
         """Make the file, with what it tells about itself."""
         self._connect()
-        rows = {"schema": SCHEMA, **about}.items()
+        told = {"schema": SCHEMA, **about}.items()
+        rows = [_told(name, value) for name, value in told]
         with self._transaction() as database:
             for statement in _TABLES.split(";"):
                 database.execute(statement)
-            database.executemany("INSERT INTO about VALUES (?, ?)", rows)
+            database.executemany("INSERT INTO about VALUES (?, ?, ?)", rows)
 
     def open(self) -> None:
         """Open a file that exists; raise StoreUnusableError if it is of another version."""
         self._connect()
-        if self.about("schema", "") != SCHEMA:
+        row = self._one("SELECT value FROM about WHERE name = 'schema'")
+        if row != (SCHEMA,):
             raise StoreUnusableError("it is from another version of this program")
 
     def verified(self) -> int:
         """Return the number of the last row; raise StoreUnusableError if one is wrong or gone."""
+        for table in ("checkpoint", "inputs"):
+            if self._one(f"PRAGMA quick_check({table})") != ("ok",):  # of pages without their rows
+                raise StoreUnusableError(f"its pages of {table} are damaged")
         last = 0
         row = self._one("SELECT after, checksum, body FROM checkpoint")
         if row is not None:
             last = row[0]
-            if zlib.crc32(row[2], last) != row[1]:
+            if not _is_whole(*row):
                 raise StoreUnusableError("its checkpoint is damaged")
         rows = self._database.execute("SELECT number, checksum, body FROM inputs ORDER BY number")
-        for number, checksum, body in rows:
-            if number != last + 1 or zlib.crc32(body, number) != checksum:
+        for row in rows:
+            if row[0] != last + 1 or not _is_whole(*row):
                 raise StoreUnusableError(f"row {last + 1} is damaged or gone")
-            last = number
+            last = row[0]
         return last
 
     def write(self, rows: Iterable[tuple[int, bytes]]) -> None:
@@ -95,27 +100,36 @@ class StoreFile:
 
     def put(self, name: str, body: bytes) -> None:
         """Put something on the shelf; raise sqlite3.Error if it cannot be."""
-        self._database.execute("REPLACE INTO shelf VALUES (?, ?)", (name, body))
+        row = (name, zlib.crc32(body, _number(name)), body)
+        self._database.execute("REPLACE INTO shelf VALUES (?, ?, ?)", row)
 
     def drop(self, name: str) -> None:
         """Take something off the shelf; raise sqlite3.Error if it cannot be."""
         self._database.execute("DELETE FROM shelf WHERE name = ?", (name,))
 
     def get(self, name: str) -> bytes | None:
-        """Return what is on the shelf under a name, or None."""
-        row = self._one("SELECT body FROM shelf WHERE name = ?", name)
-        return None if row is None else bytes(row[0])
+        """Return what is on the shelf under a name, or None if it is gone or damaged."""
+        row = self._one("SELECT checksum, body FROM shelf WHERE name = ?", name)
+        return bytes(row[1]) if row is not None and _is_whole(_number(name), *row) else None
 
-    def about(self, name: str, otherwise: str) -> str:
-        """Return what the store tells about itself under a name."""
-        row = self._one("SELECT value FROM about WHERE name = ?", name)
-        return otherwise if row is None else str(row[0])
+    def about(self, name: str, otherwise: str | None = None) -> str:
+        """Return what the store tells about itself under a name.
+
+        Raises StoreUnusableError for what is damaged, or gone where it may not be.
+        """
+        row = self._one("SELECT checksum, value FROM about WHERE name = ?", name)
+        if row is None and otherwise is not None:
+            return otherwise
+        if row is None or not _is_whole(_number(name), row[0], str(row[1]).encode()):
+            raise StoreUnusableError(f"its {name} is damaged or gone")
+        return str(row[1])
 
     def tell(self, name: str, value: str) -> None:
         """Let the store tell something about itself; not worth an error."""
         if self._connection is not None:
             with contextlib.suppress(sqlite3.Error):
-                self._connection.execute("REPLACE INTO about VALUES (?, ?)", (name, value))
+                row = _told(name, value)
+                self._connection.execute("REPLACE INTO about VALUES (?, ?, ?)", row)
 
     def set_aside(self) -> Path:
         """Give the file, its log beside it, the first free name; return it."""
@@ -183,6 +197,22 @@ class StoreFile:
             return None
         row: tuple[Any, ...] | None = self._connection.execute(query, values).fetchone()
         return row
+
+
+def _number(name: str) -> int:
+    """Return what takes a number's place in the checksum of a row that has a name."""
+    return zlib.crc32(name.encode())
+
+
+def _told(name: str, value: str) -> tuple[str, int, str]:
+    return name, zlib.crc32(value.encode(), _number(name)), value
+
+
+def _is_whole(number: object, checksum: object, body: object) -> bool:
+    """Return whether a row is as it was written; what is damaged may be of any type, or NULL."""
+    if not (isinstance(number, int) and isinstance(body, bytes)):
+        return False
+    return zlib.crc32(body, number) == checksum
 
 
 def is_about_access(error: Exception) -> bool:

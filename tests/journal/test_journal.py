@@ -1,4 +1,5 @@
 import sqlite3
+from collections import Counter
 from concurrent.futures import Future
 from pathlib import Path
 
@@ -6,7 +7,10 @@ import numpy as np
 import pytest
 
 from firmware.journal import REPLAYS_TRIED, Journal, JournalSettings, Owner
+from firmware.leader.atlas import Atlas
+from firmware.store_file import StoreUnusableError
 from protocol.errors import ConfigError
+from tests.leader.vessels import sailed
 
 OWNER = Owner(vehicle=1, fingerprint="this mission")
 INPUTS = [(1, b"one"), (2, b""), (3, bytes(range(256)))]
@@ -96,7 +100,17 @@ def test_torn_log_gives_an_earlier_commit_whole(tmp_path: Path, cut: int) -> Non
     assert len(kept) == 3 or cut
 
 
-@pytest.mark.parametrize("damage", ["noise", "empty", "half", "text", "row", "gap", "schema"])
+DAMAGES = {
+    "row": "UPDATE inputs SET body = zeroblob(40) WHERE number = 2",
+    "gap": "DELETE FROM inputs WHERE number = 2",
+    "schema": "UPDATE about SET value = '0' WHERE name = 'schema'",
+    "vehicle": "UPDATE about SET name = 'wehicle' WHERE name = 'vehicle'",
+    "epoch": "UPDATE about SET value = '7' WHERE name = 'epoch'",
+    "start": "DELETE FROM about WHERE name = 'start'",
+}
+
+
+@pytest.mark.parametrize("damage", ["noise", "empty", "half", "text", *DAMAGES])
 def test_damaged_store_is_set_aside_and_the_next_epoch_begins(
     tmp_path: Path, damage: str, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -130,14 +144,72 @@ def damage_file(path: Path, damage: str) -> None:
             path.write_bytes(b"this is no database\n")
         case _:
             with sqlite3.connect(path) as database:
-                database.execute(
-                    {
-                        "row": "UPDATE inputs SET body = zeroblob(40) WHERE number = 2",
-                        "gap": "DELETE FROM inputs WHERE number = 2",
-                        "schema": "UPDATE about SET value = '0' WHERE name = 'schema'",
-                    }[damage]
-                )
+                database.execute(DAMAGES[damage])
             database.close()
+
+
+def test_a_flipped_bit_raises_nothing_and_gives_nothing_that_was_not_put_in(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    journal, sheets = opened(tmp_path), {"one": b"sheet" * 40, "two": b"another" * 30}
+    for name, body in sheets.items():
+        journal.put(name, body)
+    journal.append(1, b"before")
+    journal.checkpoint(b"the core")
+    journal.close()
+    path, rng, fates = filled(tmp_path), np.random.default_rng(0), Counter[str]()
+    opened(tmp_path).close()
+    image = path.read_bytes()
+    used = np.flatnonzero(np.frombuffer(image, dtype=np.uint8))
+    for at in rng.choice(used, 80, replace=False):
+        damaged = bytearray(image)
+        damaged[at] ^= 1 << int(rng.integers(8))
+        path.write_bytes(damaged)
+        journal = opened(tmp_path)
+        if not journal.counters["store_set_aside"]:
+            assert journal.is_resumed
+            assert journal.checkpointed() == b"the core"
+            assert list(journal.replay()) == INPUTS
+            lost = [name for name, body in sheets.items() if journal.get(name) != body]
+            assert journal.counters["store_shelf_unread"] == len(lost)
+            fates["shelf"] += bool(lost)
+        fates["aside"] += journal.counters["store_set_aside"]
+        journal.close()
+    assert fates["aside"] > 20
+    assert fates["shelf"] > 5
+    assert len(caplog.records) == fates["aside"]
+    assert not any("\n" in record.message for record in caplog.records)
+
+
+def test_what_the_shelf_has_lost_is_counted_and_the_map_goes_on(tmp_path: Path) -> None:
+    journal = opened(tmp_path)
+    atlas = Atlas(10, journal)
+    for sheet in sailed(100.0).atlas:
+        atlas.add(sheet)
+    ids = [sheet.id for sheet in atlas]
+    for sheet_id in ids[:3]:
+        atlas.shelve(sheet_id)
+    database = journal._file._database
+    database.execute("UPDATE shelf SET body = zeroblob(99) WHERE name = '0/0/0'")
+    assert len(list(atlas.grids())) == len(ids) - 1
+    database.execute("DROP TABLE shelf")
+    assert len(list(atlas.grids())) == len(ids) - 3
+    assert journal.counters["store_shelf_unread"] == 1 + 3
+
+
+@pytest.mark.parametrize("at", ["checkpoint", "inputs"])
+def test_store_that_is_read_once_only_cannot_be_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: str
+) -> None:
+    filled(tmp_path)
+    journal = opened(tmp_path)
+
+    def fails() -> bytes:
+        raise sqlite3.OperationalError("disk I/O error")
+
+    monkeypatch.setattr(journal._file, at, fails)
+    with pytest.raises(StoreUnusableError, match="disk I/O"):
+        _ = journal.checkpointed(), list(journal.replay())
 
 
 def test_other_configuration_starts_anew_and_keeps_the_old_store(tmp_path: Path) -> None:

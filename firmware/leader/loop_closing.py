@@ -70,7 +70,11 @@ class LoopClosing:
         return SheetJobs(sheet=sheet, jobs=(*jobs, *looks), doubt=doubt)
 
     def finish(self, done: SheetJobs, findings: Findings, now_s: float) -> None:
-        """Judge what the matches of one sheet found, and bring the estimate up to it."""
+        """Judge what the matches of one sheet found, and bring the estimate up to it.
+
+        Whatever that raises, the next sheet has its turn, and the past can be composed.
+        """
+        self.is_matching = False
         false = findings.false_closures
         if done.doubt is not None and false is not None:
             self._judgement.settle(done.doubt, false, self._closures, self._graph)
@@ -94,7 +98,6 @@ class LoopClosing:
             passed = []
         self._judgement.consider(passed, self._atlas, self._graph)
         self._graph.update()
-        self.is_matching = False
         self._sheets_judged += 1
         if self._sheets_judged % self._settings.sheets_between_audits == 0:
             self._judgement.audit(self._closures, self._graph)

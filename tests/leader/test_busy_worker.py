@@ -1,4 +1,4 @@
-"""A worker that is never done in time: the leader composes its past, and resumes, all the same."""
+"""Matches that are never done in time, or not judged: the leader composes its past all the same."""
 
 from pathlib import Path
 
@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 
 from firmware.journal import Journal, JournalSettings, Owner
+from firmware.leader.atlas import Atlas
+from firmware.leader.closures import Closure
 from firmware.leader.core import LeaderCore
 from firmware.leader.journaled import JournaledLeader
 from firmware.leader.loop import LeaderLoop
 from firmware.leader.match_jobs import SheetJobs
+from firmware.leader.pose_graph import PoseGraph
 from firmware.leader.settings import LeaderSettings
 from firmware.leader.worker import Finished
 from protocol.acoustics import Water, WaterSettings
@@ -68,6 +71,24 @@ def test_worker_that_is_always_busy_does_not_starve_composition() -> None:
     leader = LeaderCore(0, start(PATH), settings=SETTINGS, slots=slots_of())
     composed_s = surveyed(leader, 300.0)
     assert len(composed_s) >= 4
+    assert leader.counters["submaps_unmatched"] == 0
+
+
+def test_judgement_that_fails_once_starves_neither_matches_nor_composition(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    leader = LeaderCore(0, start(PATH), settings=SETTINGS, slots=slots_of())
+    judgement, failures = leader._closing._judgement, [MemoryError()]
+    consider = judgement.consider
+
+    def fails_once(passed: list[Closure], atlas: Atlas, graph: PoseGraph) -> None:
+        if failures and leader._is_to_compose:
+            raise failures.pop()
+        consider(passed, atlas, graph)
+
+    monkeypatch.setattr(judgement, "consider", fails_once)
+    assert len(surveyed(leader, 300.0)) >= 4
+    assert not failures
     assert leader.counters["submaps_unmatched"] == 0
 
 

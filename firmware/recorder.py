@@ -55,7 +55,8 @@ class Recorder:
         self._last_ping_s = self._committed_s = _NEVER_S
         self._fan: bytes | None = None
         self._heard: deque[Heard] = deque(maxlen=_HEARD_AGAIN)
-        self._polled: tuple[float, bytes | None] = (_NEVER_S, None)
+        self._polled: tuple[float, list[bytes | None]] = (_NEVER_S, [])
+        self._again: deque[bytes | None] = deque()  # of these, to be answered after a restart
         self._resumed_s: float | None = None  # the last instant of the journal, until passed
 
     def unfinished_from_s(self, tick_s: float) -> float:
@@ -117,23 +118,28 @@ class Recorder:
 
     def poll(self, now_s: float) -> bool:
         """Record that the core is asked for a frame; False when the answer is known."""
-        if self._is_known(now_s, self._polled[0]):
+        last_s, _ = self._polled
+        if self._is_known(now_s, last_s) and (self._again or now_s < last_s):
             return False
-        self._resumed_s = None
+        self._ask(now_s)
         self.journal.append(Kind.POLL, from_instant(now_s))
-        self._polled = (now_s, None)
         return True
 
     def polled(self, now_s: float) -> bytes | None:
-        """Return what the core answered when it was asked at this instant before the restart."""
-        return self._polled[1] if now_s == self._polled[0] else None
+        """Return what the core answered at this instant before the restart: each answer once."""
+        return self._again.popleft() if now_s == self._polled[0] else None
 
     def before_sending(self, frame: bytes | None) -> bytes | None:
         """Return the core's frame, with everything that led to it on disk."""
+        self._polled[1].append(frame)
         if frame is not None:
-            self._polled = (self._polled[0], frame)
             self.journal.commit()
         return frame
+
+    def _ask(self, now_s: float) -> None:
+        """Begin the answers of an instant, unless it goes on; a new one is beyond the journal."""
+        if now_s != self._polled[0]:
+            self._polled, self._resumed_s = (now_s, []), None
 
     def _is_known(self, time_s: float, end_s: float) -> bool:
         """Return whether the journal, which ends at a time, holds what comes after a restart."""
@@ -169,7 +175,7 @@ class Recorder:
             except Exception:
                 self.journal.counters["store_inputs_failed"] += 1
                 LOG.exception("an input failed again in the replay")
-        self._resumed_s = self.last_tick_s
+        self._resumed_s, self._again = self.last_tick_s, deque(self._polled[1])
         self.journal.counters["store_resumed"] += 1
 
     def _replay(
@@ -195,6 +201,7 @@ class Recorder:
                 core.tick(self.last_tick_s)
             case Kind.POLL:
                 now_s = to_instant(body)
-                self._polled = (now_s, core.poll(now_s))
+                self._ask(now_s)
+                self._polled[1].append(core.poll(now_s))
             case _:
                 other(kind, body)

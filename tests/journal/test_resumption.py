@@ -1,3 +1,4 @@
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -5,12 +6,14 @@ import numpy as np
 import pytest
 
 from firmware.follower.journaled import JournaledFollower
+from firmware.follower.settings import FollowerSettings
 from firmware.inputs import fan_of, from_ping, to_odometry, to_ping
 from firmware.journal import Journal, JournalSettings, Owner
 from firmware.leader.journaled import JournaledLeader, from_findings, to_findings
 from firmware.leader.match_jobs import Findings
 from firmware.leader.matches import Hint, Match, MatchOutcome, NoMatch
 from firmware.soundings import Ping
+from firmware.submap_builder import SubmapSettings
 from host_tools.kills import Fate, MortalJournal, MortalNode, SensorTape
 from host_tools.mission import deployed, run, simulated_vehicles, water_between
 from host_tools.mission_settings import MissionSettings, changed
@@ -19,7 +22,8 @@ from host_tools.simulator.placement import place_survey
 from host_tools.simulator.terrain import open_terrain
 from host_tools.simulator.vehicle import SimulatedVehicle
 from protocol.acoustics import Delivery
-from protocol.schedule import Slots
+from protocol.schedule import Slots, SlotSettings
+from tests.leader.vessels import QUICK, line, sail, start
 
 SHORT = {
     "duration_min": 2.2,
@@ -141,6 +145,33 @@ def test_vehicles_write_themselves_down_so_that_little_is_replayed(
     assert journal.counters["store_set_aside"] == 0
     odometry_s = [to_odometry(body).time_s for kind, body in journal.replay() if kind == 1]
     assert odometry_s[0] > 85.0
+
+
+def test_frames_of_a_slot_that_a_death_cuts_short_go_out_once_each(tmp_path: Path) -> None:
+    settings = FollowerSettings(submaps=SubmapSettings(duration_s=20.0), compression=QUICK)
+    slots = Slots(SlotSettings(followers=1, follower_slot_s=8, frames_per_slot=3))
+    path = line(0.0, 60.0)
+
+    def follower(folder: Path) -> JournaledFollower:
+        journal = Journal(folder, Owner(vehicle=1, fingerprint="test"), JournalSettings())
+        return JournaledFollower(journal, 1, start(path), settings=settings, slots=slots)
+
+    core = follower(tmp_path / "undisturbed")
+    for quarter in range(1, 4 * 32 + 1):
+        sail(core, path, quarter / 4)
+        core.tick(quarter / 4)
+        if quarter < 4 * 32:
+            core.poll(quarter / 4)
+    sent = []
+    for k in range(4):
+        sent.append(core.poll(32.0))
+        core.recorder.journal.commit()
+        shutil.copytree(tmp_path / "undisturbed", tmp_path / f"dead behind {k}")
+    assert len({frame for frame in sent if frame is not None}) == 3
+    for k in range(4):
+        again = follower(tmp_path / f"dead behind {k}")
+        assert [again.poll(32.0) for _ in sent] == sent
+        assert again.counters == core.counters
 
 
 def test_ping_reads_back_within_float32_and_then_exactly() -> None:

@@ -140,7 +140,8 @@ class Composition:
                 case ClosureRecord() as closure:
                     moved = self._moved(closure)
                     if self._is_old(moved):
-                        closures[moved.origin.key, moved.target.key].append((number, entry, moved))
+                        told = moved.from_lower_key
+                        closures[told.origin.key, told.target.key].append((number, entry, told))
                         continue
                     kept[number] = Entry(record=moved, active=entry.active)
                 case RangeRecord() as ranging:

@@ -5,7 +5,7 @@ rad, log scale). Every record computes its own error, in the units of its sigmas
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -126,6 +126,13 @@ class ClosureRecord:
     target: Anchor
     offset_m: Array
     covariance_m2: Array  # (2, 2)
+
+    @property
+    def from_lower_key(self) -> "ClosureRecord":
+        """The same closure, told from the node of the lower key."""
+        if self.origin.key <= self.target.key:
+            return self
+        return replace(self, origin=self.target, target=self.origin, offset_m=-self.offset_m)
 
     def innovation_m(self, states: States) -> Array:
         """Return estimated minus measured offset (2,)."""

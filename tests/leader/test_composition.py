@@ -9,11 +9,13 @@ import pytest
 
 from firmware.geometry import Array
 from firmware.leader.chains import Chain
-from firmware.leader.composition import CompositionSettings, kept_nodes
+from firmware.leader.composition import Composition, CompositionSettings, kept_nodes
 from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.ledger import (
     AbsoluteRecord,
+    Anchor,
     ClosureRecord,
+    Entry,
     OdometryRecord,
     RangeRecord,
     Record,
@@ -273,6 +275,39 @@ def test_closure_beyond_its_sigmas_is_not_taken_along() -> None:
     left = _records(voyage.graph, ClosureRecord)
     misses_m = [record.innovation_m(voyage.graph._state) for record in left]
     assert np.hypot(*np.array(misses_m).T).max() < 8.0
+
+
+def told_by(*records: ClosureRecord) -> list[ClosureRecord]:
+    """Return what composing leaves of closures between the nodes 1 and 11, which lie 10 m apart."""
+    states = {1: np.zeros(4), 11: np.array([10.0, 0.0, 0.0, 0.0]), 90: np.array([0.02, 0.01])}
+    composition = Composition({}, {}, {1, 11}, {**states, 91: np.zeros(2)}, SETTINGS)
+    ledger = {k: Entry(record=record, active=True) for k, record in enumerate(records)}
+    coarse = composition.coarse(ledger)
+    left = [*(entry.record for entry in coarse.kept.values()), *coarse.new]
+    return [record for record in left if isinstance(record, ClosureRecord)]
+
+
+def closure(covariance_m2: Array, north_m: float = 10.0) -> ClosureRecord:
+    here = Anchor(key=1, parameters=90, offset_m=np.zeros(2), time_s=10.0, lever_m=np.full(2, 9.0))
+    there = Anchor(key=11, parameters=91, offset_m=np.zeros(2), time_s=99.0)
+    offset_m = np.array([north_m, 0.0])
+    return ClosureRecord(origin=here, target=there, offset_m=offset_m, covariance_m2=covariance_m2)
+
+
+def turned(told: ClosureRecord) -> ClosureRecord:
+    return dataclasses.replace(
+        told, origin=told.target, target=told.origin, offset_m=-told.offset_m
+    )
+
+
+def test_closures_told_from_both_ends_are_one() -> None:
+    one, other = closure(np.eye(2), 10.5), closure(np.eye(2), 9.7)
+    (same_way,) = told_by(one, other)
+    for records in ((one, turned(other)), (turned(one), other), (turned(one), turned(other))):
+        (composed,) = told_by(*records)
+        assert (composed.origin.key, composed.origin.lever_m[0]) == (1, 9.0)
+        np.testing.assert_allclose(composed.offset_m, same_way.offset_m)
+        np.testing.assert_allclose(composed.covariance_m2, np.eye(2))
 
 
 def test_every_kept_node_is_tied_to_the_one_before(coarse: Voyage) -> None:

@@ -228,7 +228,7 @@ class Composition:
         return chi_square <= self._settings.reject_chi_square
 
     def _one_closure(self, records: list[ClosureRecord]) -> ClosureRecord:
-        """Return their weighted mean, as uncertain as one of them: neighbours err alike."""
+        """Return their weighted mean, no surer for their number: neighbours err alike."""
         moved_m, covariance_m2 = self._mean(records)
         return replace(
             records[0],
@@ -237,21 +237,23 @@ class Composition:
         )
 
     def _one_fix(self, records: list[AbsoluteRecord]) -> AbsoluteRecord:
-        """Return their weighted mean, as uncertain as one of them: they share the way and a sky."""
+        """Return their weighted mean, no surer for their number: they share the way and a sky."""
         moved_m, covariance_m2 = self._mean(records)
         return replace(
             records[0], position_m=records[0].position_m + moved_m, covariance_m2=covariance_m2
         )
 
     def _mean(self, records: Sequence[ClosureRecord | AbsoluteRecord]) -> tuple[Array, Array]:
-        """Return how far the first must move to say what all say, and the covariance of one."""
-        weights = [np.linalg.inv(record.covariance_m2) for record in records]
-        covariance_m2 = np.linalg.inv(np.sum(weights, axis=0))
-        innovations_m = [record.innovation_m(self._estimate.__getitem__) for record in records]
-        mean_m = covariance_m2 @ np.sum(
-            [w @ i for w, i in zip(weights, innovations_m, strict=True)], axis=0
-        )
-        return innovations_m[0] - mean_m, len(records) * covariance_m2
+        """Return how far the first must move to say what all say, and the covariance of that.
+
+        Its information is theirs, each counted by its share in the mean: several alike tell as
+        much as one of them, and vague ones take nothing from a sure one.
+        """
+        told = np.linalg.inv([record.covariance_m2 for record in records])  # (N, 2, 2), 1/m2
+        shares = np.linalg.inv(told.sum(axis=0)) @ told
+        innovations_m = np.array([r.innovation_m(self._estimate.__getitem__) for r in records])
+        mean_m = np.einsum("nij,nj->i", shares, innovations_m)
+        return innovations_m[0] - mean_m, np.linalg.inv((told @ shares).sum(axis=0))
 
     def _one_range(self, records: list[RangeRecord]) -> RangeRecord:
         """Return the one in the middle with the weighted mean of all innovations."""

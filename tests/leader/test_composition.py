@@ -310,6 +310,30 @@ def test_closures_told_from_both_ends_are_one() -> None:
         np.testing.assert_allclose(composed.covariance_m2, np.eye(2))
 
 
+def test_closures_alike_are_as_uncertain_as_one_and_vague_ones_take_nothing_from_a_sure_one() -> (
+    None
+):
+    sure_m2 = np.array([[1.0, 0.3], [0.3, 2.0]])
+    (alike,) = told_by(*[closure(sure_m2)] * 9)
+    np.testing.assert_allclose(alike.covariance_m2, sure_m2)
+    (beside_hints,) = told_by(closure(sure_m2), *[closure(1e4 * np.eye(2), 60.0)] * 9)
+    np.testing.assert_allclose(beside_hints.covariance_m2, sure_m2, rtol=0.01)
+    assert beside_hints.offset_m == pytest.approx([10.0, 0.0], abs=0.1)
+    along, across = closure(np.diag([1.0, 1e4])), closure(np.diag([1e4, 1.0]))
+    (crossed,) = told_by(along, across)
+    np.testing.assert_allclose(crossed.covariance_m2, np.eye(2), rtol=1e-3)
+
+
+def test_composed_closures_are_never_surer_than_all_together() -> None:
+    rng = np.random.default_rng(5)
+    for count in (2, 3, 7):
+        roots_m = rng.normal(size=(count, 2, 2)) * np.geomspace(0.3, 30.0, count)[:, None, None]
+        spread_m2 = roots_m @ roots_m.transpose(0, 2, 1) + 0.01 * np.eye(2)
+        (composed,) = told_by(*[closure(each) for each in spread_m2])
+        joint = np.linalg.inv(spread_m2).sum(axis=0)
+        assert np.linalg.eigvalsh(joint - np.linalg.inv(composed.covariance_m2)).min() > -1e-6
+
+
 def test_every_kept_node_is_tied_to_the_one_before(coarse: Voyage) -> None:
     graph = coarse.graph
     for chain in graph._chains.values():

@@ -7,6 +7,7 @@ from firmware.soundings import Odometry
 
 _SET_BACK_SAMPLES = 5  # back in time one after the other: it is the clock that was set back
 _LONGEST_STEP_S = 5.0  # a longer gap is not bridged with one velocity: the position is held
+_FASTEST_MPS = 15.0  # no survey vehicle's: a log without bottom may say -32.768 m/s
 LOST_SIGMA_MPS = 3.0
 """Sigma, each axis, of how far a survey vehicle goes while nobody measures it."""
 
@@ -41,9 +42,9 @@ class DeadReckoning:
     def receive_odometry(self, odometry: Odometry) -> ReckonedState:
         """Advance to the sample's time with its mean velocity since the last one; return the state.
 
-        Non-finite velocities are replaced by the last good ones; samples that go back in time,
-        or carry no finite time, are dropped. Where they go on doing so, the clock was set back: the
-        position is held, and time goes on from there.
+        Non-finite velocities, and those that no vehicle has, are replaced by the last good ones;
+        samples that go back in time, or carry no finite time, are dropped. Where they go on doing
+        so, the clock was set back: the position is held, and time goes on from there.
         """
         self.lost_s = 0.0
         interval_s = odometry.time_s - self.state.time_s
@@ -59,7 +60,7 @@ class DeadReckoning:
             interval_s = 0.0
         self._backward = 0
         velocity_mps = (odometry.velocity_north_mps, odometry.velocity_east_mps)
-        if all(map(math.isfinite, velocity_mps)):
+        if math.hypot(*velocity_mps) <= _FASTEST_MPS:
             self._velocity_mps, unmeasured_s = velocity_mps, interval_s
             self._measured_s = odometry.time_s
         else:

@@ -69,9 +69,10 @@ def test_ping_without_attitude_gives_no_soundings() -> None:
     assert bad == 3
 
 
-def test_dead_reckoning_keeps_the_last_velocity_through_bad_samples() -> None:
+@pytest.mark.parametrize("bad_mps", [np.nan, -32.768, 1e308])
+def test_dead_reckoning_keeps_the_last_velocity_through_bad_samples(bad_mps: float) -> None:
     reckoning = DeadReckoning(START)
-    for time_s, speed_mps in ((1.0, 2.0), (2.0, np.nan), (3.0, 2.0)):
+    for time_s, speed_mps in ((1.0, 2.0), (2.0, bad_mps), (3.0, 2.0)):
         reckoning.receive_odometry(odometry(time_s, speed_mps))
     assert reckoning.state.north_m == pytest.approx(START.north_m + 6.0)
     assert reckoning.bad_samples == 1

@@ -18,13 +18,15 @@ def corner(time_s: float) -> tuple[float, float]:
 
 
 def steer(core: FollowerCore | LeaderCore, time_s: float, how: str, fix: Fix | None = None) -> None:
-    """Feed navigation around the corner: there, without velocities, or not at all."""
+    """Feed navigation around the corner: there, without velocities or with marks, or not at all."""
     is_lost = LOST_S[0] <= time_s < LOST_S[1]
     if is_lost and how == "away":
         return
     velocity_mps = np.subtract(corner(time_s), corner(time_s - 0.25)) * 4.0
     if is_lost and how == "without bottom":
         velocity_mps = np.full(2, np.nan)
+    if is_lost and how == "marked":
+        velocity_mps = np.full(2, -32.768)
     core.receive_odometry(
         Odometry(
             time_s=time_s,
@@ -55,7 +57,7 @@ def chi_square(belief: Belief) -> float:
     return float(error_m @ np.linalg.solve(belief.covariance_m2, error_m))
 
 
-@pytest.mark.parametrize("how", ["away", "without bottom"])
+@pytest.mark.parametrize("how", ["away", "without bottom", "marked"])
 def test_a_leader_doubts_where_it_is_and_believes_the_next_fix(how: str) -> None:
     leader = leader_of(corner)
     for quarter in range(1, 4 * 420 + 1):

@@ -149,7 +149,7 @@ class Ranging:
         still: deque[_Window] = deque()
         while waiting:
             window = waiting.pop()
-            placed = self._placed(window.held, (receiver, receiver_track), (chain, track), graph)
+            placed = self._placed(window, (receiver, receiver_track), (chain, track), graph)
             fate = self._enter(window, placed, graph) if placed else _Fate.ENTERED
             if fate in (_Fate.ENTERED, _Fate.ROUGHLY):
                 graph.update()
@@ -179,19 +179,21 @@ class Ranging:
 
     def _placed(
         self,
-        window: list[_HeldRange],
+        window: _Window,
         receiver: tuple[int, Track],
         sender: tuple[int, Track],
         graph: PoseGraph,
     ) -> list[_PlacedRange]:
+        """Return the ranges of a window between their anchors; those that have none leave it."""
         placed = []
-        for held in window:
+        for held in tuple(window.held):
             try:
                 here = graph.anchor(receiver[0], held.arrived_s, receiver[1])
                 there = graph.anchor(sender[0], held.sent_s, sender[1])
                 placed.append(_placed(held, here, there, sender[0], graph))
             except EstimationError:
                 self.counters["ranges_unplaceable"] += 1
+                window.held.remove(held)
         return placed
 
     def _enter(self, window: _Window, placed: list[_PlacedRange], graph: PoseGraph) -> _Fate:

@@ -7,6 +7,7 @@ import pytest
 from firmware.leader.range_judge import RangeSettings
 from firmware.leader.range_windows import Ranging, _Fate
 from firmware.submaps import Track
+from protocol.errors import EstimationError
 from tests.protocol.strategies import paper_packet
 
 DEPTH_M = 10.0
@@ -41,8 +42,8 @@ def test_window_that_stays_undecided_does_not_hold_up_older_ones(
     fates = {8: _Fate.BENT, 104: _Fate.UNDECIDED, 200: _Fate.ENTERED}
     tried: list[int] = []
 
-    def placed(_self: Ranging, held: list[object], *_: object) -> list[object]:
-        return held
+    def placed(_self: Ranging, window: MagicMock, *_: object) -> object:
+        return window.held
 
     def enter(_self: Ranging, _window: object, held: list[MagicMock], _graph: object) -> _Fate:
         begin_s = max(s for s in fates if s <= held[0].sent_s)
@@ -70,7 +71,7 @@ def test_no_window_grows_without_bound(monkeypatch: pytest.MonkeyPatch) -> None:
         sizes.append(len(held))
         return _Fate.UNDECIDED
 
-    monkeypatch.setattr(Ranging, "_placed", lambda _self, held, *_: held)
+    monkeypatch.setattr(Ranging, "_placed", lambda _self, window, *_: window.held)
     monkeypatch.setattr(Ranging, "_enter", enter)
     settings = RangeSettings(waiting=3)
     ranging = Ranging(settings)
@@ -80,6 +81,23 @@ def test_no_window_grows_without_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     assert max(sizes) <= settings.joined
     assert len(ranging._waiting[1]) == 3
     assert ranging.counters["ranges_given_up"] > 0
+
+
+def test_a_range_that_has_no_place_leaves_its_window_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    def anchor(_vehicle: int, time_s: float, _track: Track) -> MagicMock:
+        if time_s < 10.0:
+            raise EstimationError("no node near")
+        return MagicMock()
+
+    monkeypatch.setattr(Ranging, "_enter", lambda *_: _Fate.UNDECIDED)
+    ranging, graph = Ranging(RangeSettings()), MagicMock()
+    graph.anchor, graph.clock.return_value = anchor, (0.0, 0.0)
+    graph.position.return_value = np.zeros(2)
+    for begin_s in (8, 200, 400):
+        _heard(ranging, begin_s, begin_s + 24)
+        ranging.use(1, _track(begin_s + 24), 0, _track(begin_s + 24), graph)
+    assert ranging.counters["ranges_unplaceable"] == 1
+    assert [held.sent_s for held in ranging._waiting[1][0].held] == [16, 24]
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.001, 60.0])

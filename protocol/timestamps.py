@@ -7,6 +7,9 @@ TX_SECONDS_MODULO = 16
 EARLY_S = 0.5
 """A measured arrival may precede the transmission by noise; half a second bounds any clock."""
 
+_AHEAD_S = 1.0  # of our clock: an arrival later than that is a modem's error
+_LONGEST_RECEPTION_S = 16.0  # from a first bit to the last on our line: 256 bytes at 128 bit/s
+
 
 def to_quarters(time_s: float) -> int:
     """Return the mission time in quarter seconds, modulo 2**20 (72.8 h), to the nearest."""
@@ -32,6 +35,11 @@ def transmission_s(tx_second: int, toa_s: float) -> float:
     """
     latest_s = toa_s + EARLY_S
     return tx_second + TX_SECONDS_MODULO * math.floor((latest_s - tx_second) / TX_SECONDS_MODULO)
+
+
+def is_arrival(toa_s: float, now_s: float) -> bool:
+    """Return whether a frame that is handed over now can have begun to arrive at a time."""
+    return -_AHEAD_S <= now_s - toa_s <= _LONGEST_RECEPTION_S
 
 
 def one_way_travel_time_s(tx_second: int, toa_s: float) -> float:

@@ -29,11 +29,10 @@ from protocol.errors import (
 )
 from protocol.packets import Answer, ExtendedAnswer, SealedFrame
 from protocol.schedule import Slots, Turns
-from protocol.timestamps import from_quarters, to_quarters, transmission_s
+from protocol.timestamps import from_quarters, is_arrival, to_quarters, transmission_s
 from protocol.vehicles import BOOT_EPOCHS, LEADER
 
 _IDLE_STATES = 20  # as many as a trajectory packet holds
-_LONGEST_AIRTIME_S = 5.0
 
 
 @dataclass(slots=True)
@@ -258,7 +257,7 @@ class FollowerCore:
 
     def _receive_range(self, answer: ExtendedAnswer, toa_s: float, now_s: float) -> None:
         """Use an answer as a range: it says where the leader was, its travel time how far away."""
-        if not abs(now_s - toa_s) <= _LONGEST_AIRTIME_S:
+        if not is_arrival(toa_s, now_s):
             self.counters["ranges_unplaceable"] += 1
             return
         sent_s = transmission_s(answer.header.tx_second, toa_s)

@@ -40,9 +40,8 @@ from protocol.errors import RemoteProtocolError
 from protocol.packets import SealedFrame, SubmapFragment, SubmapPacket, TrajectoryPacket
 from protocol.reassembly import Reassembler
 from protocol.schedule import Slots, Turns
+from protocol.timestamps import is_arrival
 from protocol.vehicles import LEADER
-
-_AHEAD_S = 1.0  # of our clock: an arrival later than that is a modem's error
 
 
 class LeaderCore:
@@ -140,7 +139,7 @@ class LeaderCore:
             self.counters["frames_of_unknown_vehicles"] += 1
             return
         self.counters["frames_received"] += 1
-        if toa_s is not None and not -math.inf < toa_s <= now_s + _AHEAD_S:
+        if toa_s is not None and not is_arrival(toa_s, now_s):
             self.counters["arrivals_impossible"] += 1
         elif toa_s is not None:
             depth_m = self._reckoning.state.depth_m

@@ -166,7 +166,7 @@ class Ranging:
         if (
             newest is not None
             and not newest.is_judged
-            and held.sent_s - newest.held[0].sent_s <= s.joined_s
+            and abs(held.sent_s - newest.held[0].sent_s) <= s.joined_s
             and len(newest.held) < s.joined
         ):
             newest.held.append(held)

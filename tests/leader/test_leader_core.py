@@ -232,7 +232,7 @@ def test_own_sub_map_does_not_reach_over_a_gap_in_navigation() -> None:
     assert max(spans_s) <= 20.0
 
 
-@pytest.mark.parametrize("toa_s", [np.nan, np.inf, -np.inf, 5000.0])
+@pytest.mark.parametrize("toa_s", [np.nan, np.inf, -np.inf, 5000.0, 60.0])
 def test_arrival_at_no_time_is_no_range(toa_s: float) -> None:
     leader = sailed()
     for frame, _ in FRAMES:

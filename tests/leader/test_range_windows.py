@@ -83,6 +83,17 @@ def test_no_window_grows_without_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     assert ranging.counters["ranges_given_up"] > 0
 
 
+def test_a_range_told_late_joins_no_window_of_new_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Ranging, "_placed", lambda _self, window, *_: window.held)
+    monkeypatch.setattr(Ranging, "_enter", lambda *_: _Fate.UNDECIDED)
+    ranging = Ranging(RangeSettings())
+    for sent_s in (800, 8):
+        _heard(ranging, sent_s, sent_s + 8)
+        ranging.use(1, _track(820), 0, _track(820), MagicMock())
+    waiting_s = [[held.sent_s for held in window.held] for window in ranging._waiting[1]]
+    assert waiting_s == [[800], [8]]
+
+
 def test_a_range_that_has_no_place_leaves_its_window_once(monkeypatch: pytest.MonkeyPatch) -> None:
     def anchor(_vehicle: int, time_s: float, _track: Track) -> MagicMock:
         if time_s < 10.0:

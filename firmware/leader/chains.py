@@ -60,6 +60,10 @@ class Chain:
         at = bisect.bisect_left(self.times_s, time_s)
         return self.keys[at] if at < len(self.times_s) and self.times_s[at] == time_s else None
 
+    def before(self, time_s: float) -> int:
+        """Return the index of the last node at or before a time, or else of the first."""
+        return max(bisect.bisect_right(self.times_s, time_s) - 1, 0)
+
     def nearest(self, time_s: float) -> int:
         """Return the index of the node nearest to a time, the earlier of two."""
         return _nearest(self.times_s, time_s)

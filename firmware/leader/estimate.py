@@ -41,7 +41,7 @@ class Estimate:
         self._walk = settings.bias_walk
         self._solver = Solver(self._ledger, settings.robust_kernel)
         self._trajectories: dict[int, Trajectory] = {}  # both until the next change
-        self._newest_covariance: dict[int, Array] = {}
+        self._covariances: dict[int, Array] = {}  # of nodes by their keys
 
     @property
     def rebuilds(self) -> int:
@@ -193,16 +193,21 @@ class Estimate:
         return self._anchored_covariance([], anchors).reshape(len(anchors), 4, len(anchors), 4)
 
     def predicted_covariance(self, vehicle: int, time_s: float) -> Array:
-        """Return the covariance (2, 2) in m^2 of a vehicle's position at or after its last node."""
+        """Return the covariance (2, 2) in m^2 of a vehicle's position, from the last node before.
+
+        That is its newest one, unless its clock was set back.
+        """
         chain, s = self._chains[vehicle], self._settings
-        if vehicle not in self._newest_covariance:
+        node = chain.before(time_s)
+        key, node_s = chain.keys[node], chain.times_s[node]
+        if key not in self._covariances:
             self.update()
-            self._newest_covariance[vehicle] = self._solver.covariance([chain.keys[-1]])
-        ahead_s = max(time_s - chain.times_s[-1], 0.0)
+            self._covariances[key] = self._solver.covariance([key])
+        ahead_s = max(time_s - node_s, 0.0)
         carry = np.hstack([np.eye(2), -ahead_s * np.eye(2)])
         grown_m2 = reckoned_m2(ahead_s, s.odometry_noise, self._walk)
-        grown_m2 += chain.lost_m2(chain.times_s[-1], time_s)
-        covariance = self._newest_covariance[vehicle]
+        grown_m2 += chain.lost_m2(node_s, node_s + ahead_s)
+        covariance = self._covariances[key]
         return np.asarray(carry @ covariance @ carry.T + grown_m2 * np.eye(2))
 
     def newest_covariance(self, vehicles: list[int], *, reckoned: bool) -> Array:
@@ -306,4 +311,4 @@ class Estimate:
 
     def _forget_solution(self) -> None:
         self._trajectories.clear()
-        self._newest_covariance.clear()
+        self._covariances.clear()

@@ -179,6 +179,21 @@ def test_a_short_loss_costs_no_more_doubt_than_it_is_long() -> None:
     assert 5.0 < gap_s < 12.0
 
 
+def test_a_clock_that_was_ahead_and_is_set_right_leaves_an_honest_sigma() -> None:
+    """A fix while it was ahead has a node there; what is believed of now hangs on those before."""
+    leader = leader_of(corner)
+    for quarter in range(1, 4 * 150):
+        now_s = quarter / 4.0
+        is_ahead = 100.0 < now_s <= 120.0
+        north_m, east_m = corner(now_s)
+        fix = Fix(vehicle=0, north_m=north_m, east_m=east_m, sigma_m=2.0) if is_ahead else None
+        steer(leader, now_s + 1000.0 * is_ahead, "there", fix)
+        leader.tick(now_s + 1000.0 * is_ahead)
+    assert leader.belief().time_s == 149.75
+    assert (np.linalg.eigvalsh(leader.belief().covariance_m2) > 0.0).all()
+    assert chi_square(leader.belief()) < 6.0
+
+
 def test_spans_told_by_a_clock_that_was_set_back_are_all_doubted() -> None:
     graph = leader_of(corner).graph
     for begin_s, end_s in ((100.0, 150.0), (50.0, 55.0), (55.0, 60.0)):

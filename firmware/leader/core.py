@@ -302,5 +302,5 @@ class LeaderCore:
 
 
 def _is_torn(before: Submap, after: Submap, hop_s: float) -> bool:
-    """Return whether navigation was away between two stretches: what lies between is not known."""
-    return bool(after.track.time_s[0] - before.track.time_s[-1] > hop_s)
+    """Return whether navigation was away between two stretches, or their clock was set back."""
+    return not 0.0 < after.track.time_s[0] - before.track.time_s[-1] <= hop_s

@@ -232,6 +232,16 @@ def test_own_sub_map_does_not_reach_over_a_gap_in_navigation() -> None:
     assert max(spans_s) <= 20.0
 
 
+@pytest.mark.parametrize("back_s", [7.0, 30.0])
+def test_own_sub_map_does_not_reach_over_a_clock_that_is_set_back(back_s: float) -> None:
+    path = line(0.0, 0.0)
+    leader = leader_of(path, hop_s=10.0)
+    for k in range(800):
+        sail(leader, path, 0.25 * k - back_s * (k >= 440))
+    assert leader.status()["odometry_set_back"] == 1
+    assert all((np.diff(sheet.track.time_s) > 0.0).all() for sheet in leader.atlas)
+
+
 @pytest.mark.parametrize("toa_s", [np.nan, np.inf, -np.inf, 5000.0, 60.0])
 def test_arrival_at_no_time_is_no_range(toa_s: float) -> None:
     leader = sailed()

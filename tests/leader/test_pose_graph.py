@@ -1,6 +1,7 @@
 """The incremental pose graph against a dense solution of the same records."""
 
 import dataclasses
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -101,6 +102,15 @@ def test_covariance_is_that_of_the_dense_information_matrix() -> None:
     first = {key: 2 + 4 * k for k, key in enumerate(k for k in ordering if chr(k >> 56) == "x")}
     rows = [first[a.key] + axis for a in anchors for axis in (0, 1)]
     assert graph.covariance(anchors) == pytest.approx(dense_m2[np.ix_(rows, rows)], rel=1e-6)
+
+
+def test_a_leap_of_the_clock_costs_no_more_than_the_track_that_is_known() -> None:
+    track, _ = walk(np.random.default_rng(5), 200, 0.0)
+    leapt = dataclasses.replace(track, time_s=np.where(track.time_s > 100, 1e6, 0) + track.time_s)
+    with patch.object(Track, "gap_s", autospec=True, side_effect=Track.gap_s) as gap_s:
+        graph = started(leapt)
+    assert graph._chains[0].times_s == [*range(0, 101, 10), *range(1_000_100, 1_000_201, 10)]
+    assert gap_s.call_count < 30
 
 
 def test_deactivated_closure_leaves_no_trace() -> None:

@@ -7,32 +7,27 @@ from firmware.submaps import GriddedSubmap
 from host_tools.results import SoundingPatch
 from host_tools.simulator.placement import Window
 
-# Beyond this variance a reconstructed cell says nothing (paper, 4.2).
-WORST_VARIANCE_M2 = 0.1
 FINEST_SPLIT = 8
 
 
 def patch_of_grid(vehicle: int, grid: GriddedSubmap, window: Window) -> SoundingPatch:
     """Return the patch of a gridded sub-map, interpolated where the map's cells are finer.
 
-    Cells whose variance is above 0.1 m2 are left out. Each point's variance is that of its cell:
-    splitting a cell makes its information no larger, only more finely spread.
+    Each point's variance is that of its cell: splitting a cell makes its information no larger,
+    only more finely spread.
     """
     cell_m = min(window.cell_north_m, window.cell_east_m)
     split = int(np.clip(np.ceil(grid.cell_m / cell_m - 1e-6), 1, FINEST_SPLIT))
-    with np.errstate(invalid="ignore"):
-        good = np.isfinite(grid.depth_m) & (grid.variance_m2 <= WORST_VARIANCE_M2)
     rows, columns = grid.depth_m.shape
     row = np.arange((rows - 1) * split + 1) / split
     column = np.arange((columns - 1) * split + 1) / split
     at = np.stack(np.meshgrid(row, column, indexing="ij")).reshape(2, -1)
     layers = []
     for layer in (grid.depth_m, grid.variance_m2, grid.time_s):
-        known = np.where(good, layer, np.nan)
         if split > 1:
-            layers.append(ndimage.map_coordinates(known, at, order=1, mode="nearest"))
+            layers.append(ndimage.map_coordinates(layer, at, order=1, mode="nearest"))
         else:
-            layers.append(known.ravel())
+            layers.append(layer.ravel())
     depth_m, variance_m2, time_s = layers
     kept = np.isfinite(depth_m)
     return SoundingPatch(

@@ -35,14 +35,14 @@ def grid() -> GriddedSubmap:
     )
 
 
-def test_patch_of_a_coarse_map_holds_the_good_cells_as_they_are() -> None:
+def test_patch_of_a_coarse_map_holds_the_known_cells_as_they_are() -> None:
     patch = patch_of_grid(1, grid(), window(5.0))
-    assert patch.depth_m.size == 5 * 4
+    assert patch.depth_m.size == 6 * 4
     np.testing.assert_allclose(
         patch.depth_m, 40 + (patch.north_m - 10) / 2 + 0.25 * (patch.east_m - 20)
     )
     np.testing.assert_allclose(patch.time_s, 100 + (patch.north_m - 10) / 2)
-    assert set(patch.variance_m2.tolist()) == {0.02}
+    assert set(patch.variance_m2.tolist()) == {0.02, 0.2}  # as from high above the seabed
 
 
 def test_patch_of_a_fine_map_is_interpolated_without_gaining_information() -> None:

@@ -97,8 +97,8 @@ def _shared_walk(record: SharedWalkRecord) -> gtsam.NonlinearFactor:
         if jacobians is not None:
             for k, sign in enumerate(signs):
                 jacobians[k] = sign * _BIAS
-        changes = [sign * values.atVector(k)[2:] for sign, k in zip(signs, keys, strict=True)]
-        return np.asarray(sum(changes))
+        one, other, one_later, other_later = map(values.atVector, keys)
+        return np.asarray((one - other - one_later + other_later)[2:])
 
     return _custom(gtsam.noiseModel.Isotropic.Sigma(2, record.sigma_mps), keys, error)
 
@@ -110,14 +110,20 @@ def _custom(
 
 
 def _closure(record: ClosureRecord, noise: gtsam.noiseModel.Base) -> gtsam.NonlinearFactor:
-    """Return a factor of two nodes and of the parameters of one vehicle, or of two."""
+    """Return a factor of two nodes and of the parameters of one vehicle, or of two.
+
+    Its innovation is linear, but its noise is robust, so that gtsam has no factor of its own.
+    """
     ways = _way(record.origin, record.target)
+    whole = np.hstack(list(ways.values()))
+    at_zero_m = record.innovation_m(lambda key: np.zeros(ways[key].shape[1]))
 
     def error(_this: object, values: gtsam.Values, jacobians: _Jacobians) -> Array:
         if jacobians is not None:
             for k, way in enumerate(ways.values()):
                 jacobians[k] = way
-        return record.innovation_m(values.atVector)
+        states = np.concatenate([values.atVector(key) for key in ways])
+        return np.asarray(whole @ states + at_zero_m)
 
     return _custom(noise, list(ways), error)
 

@@ -187,6 +187,13 @@ class Journal:
             self._file.tell("start", text)
         return kept or text
 
+    def count_epoch(self, epoch: int) -> None:
+        """Count an epoch that a core has begun by itself: its next life takes another."""
+        try:
+            self._epochs.write(epoch)
+        except OSError:
+            self.counters["store_epochs_uncounted"] += 1
+
     def give_up(self, why: str) -> None:
         """Set this store aside and begin a new one in the next boot epoch."""
         self._close()
@@ -203,9 +210,8 @@ class Journal:
         self._close()
         self._compressor.shutdown(wait=False)
 
-    # inside
-
     def _file_at(self, path: Path) -> StoreFile:
+        """Return the file of this store; simulated disks take another."""
         return StoreFile(path)
 
     def _open(self) -> None:
@@ -254,13 +260,6 @@ class Journal:
                 "epoch": str(epoch),
             }
         )
-
-    def count_epoch(self, epoch: int) -> None:
-        """Count an epoch that a core has begun by itself: its next life takes another."""
-        try:
-            self._epochs.write(epoch)
-        except OSError:
-            self.counters["store_epochs_uncounted"] += 1
 
     def _next_epoch(self) -> int:
         try:

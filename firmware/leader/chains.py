@@ -38,8 +38,8 @@ class Chain:
 
     def lose(self, begin_s: float, end_s: float) -> None:
         """Remember a span of which nobody knows how far the vehicle went; bounded."""
-        while self.lost and begin_s <= self.lost[-1][1] <= end_s:
-            begin_s = min(begin_s, self.lost.pop()[0])
+        if self.lost and begin_s <= self.lost[-1][1] <= end_s:
+            begin_s = self.lost.pop()[0]
         self.lost.append((begin_s, end_s))
         if len(self.lost) > _MOST_SPANS:
             gaps_s = [after[0] - before[1] for before, after in itertools.pairwise(self.lost)]

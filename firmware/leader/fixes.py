@@ -1,8 +1,7 @@
 """Absolute positions: GNSS at the surface, USBL from a ship or about a follower. Judged, then used.
 
 A fix waits until its vehicle's dead reckoning is known at its time. It is gated by the estimate's
-own covariance: an impossible one is counted and dropped. Where refused fixes agree with the
-estimate on the way between them, it is the estimate that is doubted.
+own covariance: an impossible one is counted and dropped.
 """
 
 from collections import Counter, deque
@@ -10,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from firmware.geometry import Array, offset_covariance
 from firmware.leader.fleet import Fleet
 from firmware.leader.pose_graph import PoseGraph
 from firmware.soundings import Fix
@@ -42,7 +40,6 @@ class Fixes:
         self.counters: Counter[str] = Counter()
         self._settings = settings
         self._held: deque[tuple[float, Fix]] = deque(maxlen=settings.held)
-        self._refused: dict[int, tuple[float, Fix]] = {}  # by chain, the first since one was used
 
     def hold(self, time_s: float, fix: Fix) -> None:
         """Keep a fix until it can be used."""
@@ -73,43 +70,12 @@ class Fixes:
         chain = fleet.chain_at(fix.vehicle, time_s)
         fleet.extend(chain)
         anchor = graph.anchor(chain, time_s, fleet.track(chain))
-        position_m, covariance_m2 = _position(fix), self._covariance(fix)
+        variance_m2 = fix.sigma_m**2 + self._settings.sigma_floor_m**2
+        position_m = np.array([fix.north_m, fix.east_m])
         innovation_m = position_m - graph.position(anchor)
-        if not self._is_possible(innovation_m, graph.covariance([anchor]) + covariance_m2):
-            if np.hypot(*innovation_m) <= self._settings.sigma_limit_m:
-                self._doubt(time_s, fix, chain, fleet, graph)
+        spread_m2 = graph.covariance([anchor]) + variance_m2 * np.eye(2)
+        if innovation_m @ np.linalg.solve(spread_m2, innovation_m) > self._settings.gate_chi_square:
             return "fixes_rejected"
-        graph.add_absolute(anchor, position_m, covariance_m2)
+        graph.add_absolute(anchor, position_m, variance_m2 * np.eye(2))
         graph.update()
-        self._refused.pop(chain, None)
         return "fixes_used"
-
-    def _doubt(self, time_s: float, fix: Fix, chain: int, fleet: Fleet, graph: PoseGraph) -> None:
-        """Doubt the estimate between two refused fixes that tell of the way there what it does.
-
-        Doubt grows while they go on so. A fix that is wrong by itself tells of another way; so does
-        a receiver that is stuck, as soon as the vehicle went farther than both may err.
-        """
-        first_s, first = self._refused.setdefault(chain, (time_s, fix))
-        ends = [graph.anchor(chain, at_s, fleet.track(chain)) for at_s in (first_s, time_s)]
-        way_m, told_m = graph.offset(*ends), _position(fix) - _position(first)
-        spread_m2 = offset_covariance(graph.covariance(ends))
-        spread_m2 += self._covariance(first) + self._covariance(fix)
-        is_alike = self._is_possible(told_m - way_m, spread_m2)
-        if is_alike and self._is_possible(way_m, spread_m2):
-            return
-        self._refused[chain] = time_s, fix
-        if is_alike:
-            graph.lose(chain, *sorted((first_s, time_s)))
-            graph.update()
-            self.counters["fixes_that_cast_doubt"] += 1
-
-    def _is_possible(self, miss_m: Array, spread_m2: Array) -> bool:
-        return bool(miss_m @ np.linalg.solve(spread_m2, miss_m) <= self._settings.gate_chi_square)
-
-    def _covariance(self, fix: Fix) -> Array:
-        return (fix.sigma_m**2 + self._settings.sigma_floor_m**2) * np.eye(2)
-
-
-def _position(fix: Fix) -> Array:
-    return np.array([fix.north_m, fix.east_m])

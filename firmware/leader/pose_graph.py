@@ -27,7 +27,6 @@ from firmware.leader.ledger import (
     Anchor,
     ClosureRecord,
     Entry,
-    OdometryRecord,
     PriorRecord,
     RangeRecord,
     Record,
@@ -112,21 +111,8 @@ class PoseGraph(Estimate):
         return added
 
     def lose(self, vehicle: int, begin_s: float, end_s: float) -> None:
-        """Say of a span that nobody knows how far a vehicle went in it.
-
-        Where there are nodes already, dead reckoning joins them anew.
-        """
-        chain = self._chains[vehicle]
-        chain.lose(begin_s, end_s)
-        first = chain.before(begin_s) + 1
-        later = set(chain.keys[first:])
-        if not later:
-            return
-        for number, entry in self._ledger.items():
-            if isinstance(entry.record, OdometryRecord) and entry.record.target in later:
-                self.set_active(number, active=False)
-        for node in range(first, len(chain.keys)):
-            self._join(chain, node)
+        """Say of a span, before it has nodes, that nobody knows how far a vehicle went in it."""
+        self._chains[vehicle].lose(begin_s, end_s)
 
     def add_closure(
         self, origin: Anchor, target: Anchor, offset_m: Array, covariance_m2: Array, *, active: bool

@@ -155,7 +155,7 @@ class Solver:
     def _reckoning(self) -> gtsam.ISAM2:
         graph = gtsam.NonlinearFactorGraph()
         for number, entry in self._ledger.items():
-            if entry.active and isinstance(entry.record, _RECKONING):
+            if isinstance(entry.record, _RECKONING):
                 graph.push_back(self._factor(number))
         isam = _new_isam(self._factorization)
         isam.update(graph, self._values)

@@ -7,7 +7,6 @@ from firmware.belief import Belief
 from firmware.follower.core import FollowerCore
 from firmware.leader.core import LeaderCore
 from firmware.soundings import Fix, Odometry, Ping
-from firmware.submaps import Track
 from tests.leader.vessels import ANGLES_RAD, Convoy, follower_of, leader_of, line, sail
 
 LOST_S = (200.0, 260.0)
@@ -200,26 +199,3 @@ def test_spans_told_by_a_clock_that_was_set_back_are_all_doubted() -> None:
     for begin_s, end_s in ((100.0, 150.0), (50.0, 55.0), (55.0, 60.0)):
         graph.lose(0, begin_s, end_s)
     assert graph._chains[0].lost == [(100.0, 150.0), (50.0, 60.0)]
-
-
-def straight(end_s: float) -> Track:
-    time_s = np.arange(end_s + 1.0)
-    return Track(time_s=time_s, north_m=time_s, east_m=0 * time_s, yaw_rad=0 * time_s)
-
-
-def test_a_span_that_is_doubted_afterwards_counts_as_one_that_was_lost_at_once() -> None:
-    sigmas_m = []
-    for known_s in (30.0, 100.0):
-        graph = leader_of(line(0.0, 0.0)).graph
-        graph.extend(0, straight(known_s))
-        graph.update()
-        graph.lose(0, 35.0, 65.0)
-        graph.extend(0, straight(100.0))
-        graph.update()
-        ends = [graph.anchor(0, at_s, straight(100.0)) for at_s in (30.0, 40.0, 60.0, 100.0)]
-        for joint_m2 in (graph.covariance(ends), graph.newest_covariance([0], reckoned=True)):
-            sigmas_m.append(np.sqrt(np.diag(joint_m2)))
-    assert sigmas_m[0][0] < 10.0
-    assert sigmas_m[0][-1] > 90.0
-    assert sigmas_m[2] == pytest.approx(sigmas_m[0], rel=1e-6)
-    assert sigmas_m[3] == pytest.approx(sigmas_m[1], rel=1e-6)

@@ -246,14 +246,16 @@ class Composition:
     def _mean(self, records: Sequence[ClosureRecord | AbsoluteRecord]) -> tuple[Array, Array]:
         """Return how far the first must move to say what all say, and the covariance of that.
 
-        Its information is theirs, each counted by its share in the mean: several alike tell as
-        much as one of them, and vague ones take nothing from a sure one.
+        Covariance intersection, weighted by how much each tells: whatever they share, several alike
+        tell no more than one of them, and vague ones take nothing from a sure one.
         """
         told = np.linalg.inv([record.covariance_m2 for record in records])  # (N, 2, 2), 1/m2
-        shares = np.linalg.inv(told.sum(axis=0)) @ told
+        shares = np.trace(told, axis1=1, axis2=2)
+        told *= (shares / shares.sum())[:, None, None]
         innovations_m = np.array([r.innovation_m(self._estimate.__getitem__) for r in records])
-        mean_m = np.einsum("nij,nj->i", shares, innovations_m)
-        return innovations_m[0] - mean_m, np.linalg.inv((told @ shares).sum(axis=0))
+        covariance_m2 = np.linalg.inv(told.sum(axis=0))
+        mean_m = covariance_m2 @ np.einsum("nij,nj->i", told, innovations_m)
+        return innovations_m[0] - mean_m, covariance_m2
 
     def _one_range(self, records: list[RangeRecord]) -> RangeRecord:
         """Return the one in the middle with the weighted mean of all innovations."""

@@ -321,7 +321,19 @@ def test_closures_alike_are_as_uncertain_as_one_and_vague_ones_take_nothing_from
     assert beside_hints.offset_m == pytest.approx([10.0, 0.0], abs=0.1)
     along, across = closure(np.diag([1.0, 1e4])), closure(np.diag([1e4, 1.0]))
     (crossed,) = told_by(along, across)
-    np.testing.assert_allclose(crossed.covariance_m2, np.eye(2), rtol=1e-3)
+    np.testing.assert_allclose(crossed.covariance_m2, 2.0 * np.eye(2), rtol=1e-3)
+
+
+def test_one_axis_closures_tell_as_much_together_as_one_of_them() -> None:
+    rng = np.random.default_rng(6)
+    for scatter_rad in (0.0, 0.02):  # of their axes
+        axes = np.array([[np.cos(a), np.sin(a)] for a in scatter_rad * rng.normal(size=20)])
+        (composed,) = told_by(*[closure(one_axis(axis)) for axis in axes])
+        assert np.linalg.eigvalsh(composed.covariance_m2)[0] == pytest.approx(0.64, rel=0.01)
+
+
+def one_axis(axis: Array) -> Array:
+    return 1e8 * np.eye(2) - (1e8 - 0.64) * np.outer(axis, axis)
 
 
 def test_composed_closures_are_never_surer_than_all_together() -> None:

@@ -7,8 +7,8 @@ TX_SECONDS_MODULO = 16
 EARLY_S = 0.5
 """A measured arrival may precede the transmission by noise; half a second bounds any clock."""
 
-_AHEAD_S = 1.0  # of our clock: an arrival later than that is a modem's error
-_LONGEST_RECEPTION_S = 16.0  # from a first bit to the last on our line: 256 bytes at 128 bit/s
+_AHEAD_S = 1.0  # an arrival farther ahead of our clock is a modem's error
+_LONGEST_RECEPTION_S = 60.0  # until a frame is handed over: it sounds for 51 s at 40 bit/s
 
 
 def to_quarters(time_s: float) -> int:

@@ -56,7 +56,7 @@ class Recorder:
         self._fan: bytes | None = None
         self._heard: deque[Heard] = deque(maxlen=_HEARD_AGAIN)
         self._polled: tuple[float, list[bytes | None]] = (_NEVER_S, [])
-        self._again: deque[bytes | None] = deque()  # of these, to be answered after a restart
+        self._again: deque[bytes | None] = deque()  # of them, still to be given once more
         self._resumed_s: float | None = None  # the last instant of the journal, until passed
 
     def unfinished_from_s(self, tick_s: float) -> float:

@@ -42,7 +42,7 @@ class StoreFile:
         """Make the file, with what it tells about itself."""
         self._connect()
         told = {"schema": SCHEMA, **about}.items()
-        rows = [_told(name, value) for name, value in told]
+        rows = [_about_row(name, value) for name, value in told]
         with self._transaction() as database:
             for statement in _TABLES.split(";"):
                 database.execute(statement)
@@ -58,7 +58,7 @@ class StoreFile:
     def verified(self) -> int:
         """Return the number of the last row; raise StoreUnusableError if one is wrong or gone."""
         for table in ("checkpoint", "inputs"):
-            if self._one(f"PRAGMA quick_check({table})") != ("ok",):  # of pages without their rows
+            if self._one(f"PRAGMA quick_check({table})") != ("ok",):  # rows alone do not show it
                 raise StoreUnusableError(f"its pages of {table} are damaged")
         last = 0
         row = self._one("SELECT after, checksum, body FROM checkpoint")
@@ -128,7 +128,7 @@ class StoreFile:
         """Let the store tell something about itself; not worth an error."""
         if self._connection is not None:
             with contextlib.suppress(sqlite3.Error):
-                row = _told(name, value)
+                row = _about_row(name, value)
                 self._connection.execute("REPLACE INTO about VALUES (?, ?, ?)", row)
 
     def set_aside(self) -> Path:
@@ -204,7 +204,7 @@ def _number(name: str) -> int:
     return zlib.crc32(name.encode())
 
 
-def _told(name: str, value: str) -> tuple[str, int, str]:
+def _about_row(name: str, value: str) -> tuple[str, int, str]:
     return name, zlib.crc32(value.encode(), _number(name)), value
 
 

@@ -28,7 +28,7 @@ from firmware.leader.offsets import corrections
 from firmware.leader.outlook import Outlook
 from firmware.leader.own_grid import grid_of
 from firmware.leader.pose_graph import PoseGraph
-from firmware.leader.range_windows import Ranging
+from firmware.leader.range_windows import RangeWindows
 from firmware.leader.settings import LeaderSettings, reassembly_of
 from firmware.leader.shelf import Shelf
 from firmware.leader.trajectory import Trajectory
@@ -74,7 +74,7 @@ class LeaderCore:
         self._stretches: deque[Submap] = deque(maxlen=hops)
         self._tracked_s = -math.inf  # the newest state of the own track
         self._reassembler = Reassembler(reassembly_of(settings, slots))
-        self._ranging = Ranging(settings.ranges)
+        self._ranging = RangeWindows(settings.ranges)
         self.fleet = Fleet(self.graph, self._ranging, settings.fleet)
         self._fixes = Fixes(settings.fixes)
         self._answers = Answers(

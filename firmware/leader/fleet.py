@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from firmware.geometry import Array
 from firmware.leader.atlas import chain_of, vehicle_of
 from firmware.leader.pose_graph import PoseGraph
-from firmware.leader.range_windows import Ranging
+from firmware.leader.range_windows import RangeWindows
 from firmware.leader.tracks import TrackBuffer
 from firmware.leader.trajectory import Trajectory
 from firmware.submaps import Track
@@ -56,7 +56,7 @@ class _Vehicle:
 class Fleet:
     """Tracks and chains of all vehicles; the leader's own track is among them."""
 
-    def __init__(self, graph: PoseGraph, ranging: Ranging, settings: FleetSettings) -> None:
+    def __init__(self, graph: PoseGraph, ranging: RangeWindows, settings: FleetSettings) -> None:
         self.counters: Counter[str] = Counter()
         self._graph, self._ranging, self._settings = graph, ranging, settings
         self._tracks: dict[int, TrackBuffer] = {LEADER: TrackBuffer()}

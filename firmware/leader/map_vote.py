@@ -1,8 +1,8 @@
 """Whether the map that a closure builds agrees with itself where the match did not look.
 
 The paper rejects invalid closures by the consistency of the map they build (its MCM; the reference
-is not available, so this is designed from the paper's description). A closure between two
-sub-maps moves their neighbours along with it. Where neighbours then overlap, a valid closure lays
+is not available, so this is designed from the paper's description). A closure between two sub-maps
+moves their neighbours along with it. Where neighbours then overlap, a valid closure lays
 like on like, and an invalid one does not. Each such window votes with a log-likelihood ratio of
 agreement against unrelated seabed, averaged over what dead reckoning leaves open; a flat seabed
 and a window without overlap abstain.

@@ -96,12 +96,12 @@ class PoseGraph(Estimate):
             return 0
         chain, s = self._chains[vehicle], self._settings
         interval_s = s.node_interval_s
-        begin = np.floor(chain.times_s[-1] / interval_s + 1e-9) + 1
-        end = np.floor(track.time_s[-1] / interval_s + 1e-9)
-        near = track.time_s[np.searchsorted(track.time_s, (begin - 1) * interval_s) :] / interval_s
+        first = np.floor(chain.times_s[-1] / interval_s + 1e-9) + 1
+        last = np.floor(track.time_s[-1] / interval_s + 1e-9)
+        near = track.time_s[np.searchsorted(track.time_s, (first - 1) * interval_s) :] / interval_s
         epochs = np.unique([np.floor(near), np.ceil(near)])  # few, however far a clock leaps
         added = 0
-        for epoch in epochs[(begin <= epochs) & (epochs <= end)].tolist():
+        for epoch in epochs[(first <= epochs) & (epochs <= last)].tolist():
             time_s = epoch * interval_s
             if track.gap_s(time_s) <= interval_s / 2:
                 self._step(chain, time_s, track.position_at(time_s))

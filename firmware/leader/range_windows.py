@@ -84,7 +84,7 @@ class _Fate(enum.Enum):
     UNDECIDED = enum.auto()
 
 
-class Ranging:
+class RangeWindows:
     """Ranges in by `hold`, factors out by `use`; bounded, everything dropped is counted."""
 
     def __init__(self, settings: RangeSettings) -> None:
@@ -201,8 +201,7 @@ class Ranging:
 
         A window whose bend its noise does not hide is entered with a sigma that grows with the
         bend, and anew once it bends half as much; the new verdict rests on the first to a small
-        part. Records
-        that were composed with others meanwhile stay as they are.
+        part. Records that were composed with others meanwhile stay as they are.
         """
         if not all(number in graph for number in window.entered):
             self.counters["ranges_left_rough"] += len(placed)

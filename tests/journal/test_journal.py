@@ -198,7 +198,7 @@ def test_what_the_shelf_has_lost_is_counted_and_the_map_goes_on(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("at", ["checkpoint", "inputs"])
-def test_store_that_is_read_once_only_cannot_be_used(
+def test_store_that_can_no_longer_be_read_cannot_be_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: str
 ) -> None:
     filled(tmp_path)

@@ -11,7 +11,7 @@ from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.ledger import RangeRecord
 from firmware.leader.pose_graph import PoseGraph
 from firmware.leader.range_judge import RangeSettings
-from firmware.leader.range_windows import Ranging
+from firmware.leader.range_windows import RangeWindows
 from firmware.submaps import Track
 from tests.protocol.strategies import paper_packet
 
@@ -39,7 +39,7 @@ def ranged(settings: GraphSettings) -> PoseGraph:
         start_m = tracks[vehicle].position_at(0.0)
         graph.add_vehicle(vehicle, 0.0, start_m, start_m)
         graph.extend(vehicle, tracks[vehicle])
-    ranging, header = Ranging(RangeSettings()), replace(paper_packet().header, tx_second=0)
+    ranging, header = RangeWindows(RangeSettings()), replace(paper_packet().header, tx_second=0)
     for sent_s in range(16, int(END_S) - 16, 16):
         ranging.hold(1, header, _arrival_s(sent_s, tracks), 10.0)
         ranging.use(1, tracks[1], 0, tracks[0], graph)

@@ -8,7 +8,7 @@ from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.ledger import Anchor, RangeRecord
 from firmware.leader.pose_graph import PoseGraph
 from firmware.leader.range_judge import RangeSettings
-from firmware.leader.range_windows import Ranging
+from firmware.leader.range_windows import RangeWindows
 from firmware.submaps import Track
 from protocol.packets import Header, Profile
 
@@ -34,7 +34,7 @@ class Pair:
         rng = np.random.default_rng(seed)
         self.true_m = [survey(0), survey(1)]
         self.reckoned_m = []
-        self.graph, self.ranging = PoseGraph(GraphSettings()), Ranging(RangeSettings())
+        self.graph, self.ranging = PoseGraph(GraphSettings()), RangeWindows(RangeSettings())
         for vehicle, true_m in enumerate(self.true_m):
             steps_m = rng.normal(0.0, 0.2, (DURATION_S, 2)) + rng.normal(0.0, 0.15, 2)
             self.reckoned_m.append(true_m + np.cumsum(np.vstack([np.zeros(2), steps_m]), axis=0))

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from firmware.leader.range_judge import RangeSettings
-from firmware.leader.range_windows import Ranging, _Fate
+from firmware.leader.range_windows import RangeWindows, _Fate
 from firmware.submaps import Track
 from protocol.errors import EstimationError
 from tests.protocol.strategies import paper_packet
@@ -14,7 +14,7 @@ DEPTH_M = 10.0
 
 
 def test_frames_of_one_packet_give_one_range() -> None:
-    ranging = Ranging(RangeSettings())
+    ranging = RangeWindows(RangeSettings())
     header = replace(paper_packet().header, tx_second=8)
     for fragment in (0, 1):
         ranging.hold(1, replace(header, fragment=fragment), 8.4, DEPTH_M)
@@ -29,7 +29,7 @@ def _track(end_s: float) -> Track:
     return Track(time_s=times_s, north_m=times_s, east_m=0 * times_s, yaw_rad=0 * times_s)
 
 
-def _heard(ranging: Ranging, begin_s: int, end_s: int) -> None:
+def _heard(ranging: RangeWindows, begin_s: int, end_s: int) -> None:
     header = paper_packet().header
     for sent_s in range(begin_s, end_s, 8):
         ranging.hold(1, replace(header, tx_second=sent_s % 16), sent_s + 0.4, DEPTH_M)
@@ -42,17 +42,17 @@ def test_window_that_stays_undecided_does_not_hold_up_older_ones(
     fates = {8: _Fate.BENT, 104: _Fate.UNDECIDED, 200: _Fate.ENTERED}
     tried: list[int] = []
 
-    def placed(_self: Ranging, window: MagicMock, *_: object) -> object:
+    def placed(_self: RangeWindows, window: MagicMock, *_: object) -> object:
         return window.held
 
-    def enter(_self: Ranging, _window: object, held: list[MagicMock], _graph: object) -> _Fate:
+    def enter(_self: RangeWindows, _window: object, held: list[MagicMock], _graph: object) -> _Fate:
         begin_s = max(s for s in fates if s <= held[0].sent_s)
         tried.append(begin_s)
         return fates[begin_s]
 
-    monkeypatch.setattr(Ranging, "_placed", placed)
-    monkeypatch.setattr(Ranging, "_enter", enter)
-    ranging, graph = Ranging(RangeSettings()), MagicMock()
+    monkeypatch.setattr(RangeWindows, "_placed", placed)
+    monkeypatch.setattr(RangeWindows, "_enter", enter)
+    ranging, graph = RangeWindows(RangeSettings()), MagicMock()
     for begin_s, end_s in ((8, 60), (104, 160)):
         _heard(ranging, begin_s, end_s)
         ranging.use(1, _track(end_s), 0, _track(end_s), graph)
@@ -67,14 +67,14 @@ def test_window_that_stays_undecided_does_not_hold_up_older_ones(
 def test_no_window_grows_without_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     sizes: list[int] = []
 
-    def enter(_self: Ranging, _window: object, held: list[object], _graph: object) -> _Fate:
+    def enter(_self: RangeWindows, _window: object, held: list[object], _graph: object) -> _Fate:
         sizes.append(len(held))
         return _Fate.UNDECIDED
 
-    monkeypatch.setattr(Ranging, "_placed", lambda _self, window, *_: window.held)
-    monkeypatch.setattr(Ranging, "_enter", enter)
+    monkeypatch.setattr(RangeWindows, "_placed", lambda _self, window, *_: window.held)
+    monkeypatch.setattr(RangeWindows, "_enter", enter)
     settings = RangeSettings(waiting=3)
-    ranging = Ranging(settings)
+    ranging = RangeWindows(settings)
     for begin_s in range(0, 1600, 200):
         _heard(ranging, begin_s, begin_s + 200)
         ranging.use(1, _track(begin_s + 200), 0, _track(begin_s + 200), MagicMock())
@@ -84,9 +84,9 @@ def test_no_window_grows_without_bound(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_range_told_late_joins_no_window_of_new_ones(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Ranging, "_placed", lambda _self, window, *_: window.held)
-    monkeypatch.setattr(Ranging, "_enter", lambda *_: _Fate.UNDECIDED)
-    ranging = Ranging(RangeSettings())
+    monkeypatch.setattr(RangeWindows, "_placed", lambda _self, window, *_: window.held)
+    monkeypatch.setattr(RangeWindows, "_enter", lambda *_: _Fate.UNDECIDED)
+    ranging = RangeWindows(RangeSettings())
     for sent_s in (800, 8):
         _heard(ranging, sent_s, sent_s + 8)
         ranging.use(1, _track(820), 0, _track(820), MagicMock())
@@ -100,8 +100,8 @@ def test_a_range_that_has_no_place_leaves_its_window_once(monkeypatch: pytest.Mo
             raise EstimationError("no node near")
         return MagicMock()
 
-    monkeypatch.setattr(Ranging, "_enter", lambda *_: _Fate.UNDECIDED)
-    ranging, graph = Ranging(RangeSettings()), MagicMock()
+    monkeypatch.setattr(RangeWindows, "_enter", lambda *_: _Fate.UNDECIDED)
+    ranging, graph = RangeWindows(RangeSettings()), MagicMock()
     graph.anchor, graph.clock.return_value = anchor, (0.0, 0.0)
     graph.position.return_value = np.zeros(2)
     for begin_s in (8, 200, 400):
@@ -113,7 +113,7 @@ def test_a_range_that_has_no_place_leaves_its_window_once(monkeypatch: pytest.Mo
 
 @pytest.mark.parametrize("late_s", [0.0, 0.001, 60.0])
 def test_impossible_ranges_are_counted_and_not_held(late_s: float) -> None:
-    ranging = Ranging(RangeSettings())
+    ranging = RangeWindows(RangeSettings())
     ranging.hold(1, replace(paper_packet().header, tx_second=8), 8.0 + late_s, DEPTH_M)
     assert not ranging._held
     assert ranging.counters["ranges_impossible"] == 1

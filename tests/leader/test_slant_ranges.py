@@ -9,7 +9,7 @@ from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.ledger import RangeRecord
 from firmware.leader.pose_graph import PoseGraph
 from firmware.leader.range_judge import RangeSettings
-from firmware.leader.range_windows import Ranging
+from firmware.leader.range_windows import RangeWindows
 from firmware.sound_speed import SoundProfile
 from firmware.soundings import Odometry
 from firmware.submaps import Track
@@ -62,9 +62,9 @@ def arrivals_s(apart_m: float, outlier_share: float = 0.0) -> list[float]:
 
 def ranged(
     settings: RangeSettings, apart_m: float, arrived_s: list[float]
-) -> tuple[Ranging, list[RangeRecord]]:
+) -> tuple[RangeWindows, list[RangeRecord]]:
     """Return what becomes of arrivals between two vehicles that lie still, apart_m across."""
-    graph, ranging = PoseGraph(SURE), Ranging(settings)
+    graph, ranging = PoseGraph(SURE), RangeWindows(settings)
     tracks = [still(0.0, 0.0), still(0.0, apart_m)]
     for vehicle, track in enumerate(tracks):
         start_m = track.position_at(0.0)
@@ -78,9 +78,9 @@ def ranged(
     return ranging, [record for record in records if isinstance(record, RangeRecord)]
 
 
-def held(settings: RangeSettings, way_m: float, speed_mps: float, depth_m: float) -> Ranging:
+def held(settings: RangeSettings, way_m: float, speed_mps: float, depth_m: float) -> RangeWindows:
     """Return what became of one frame that travelled for way_m at a speed."""
-    ranging = Ranging(settings)
+    ranging = RangeWindows(settings)
     header = replace(paper_packet().header, tx_second=8)
     ranging.hold(1, header, 8.0 + way_m / speed_mps, depth_m)
     return ranging

@@ -249,12 +249,12 @@ class Composition:
         Covariance intersection, weighted by how much each tells: whatever they share, several alike
         tell no more than one of them, and vague ones take nothing from a sure one.
         """
-        told = np.linalg.inv([record.covariance_m2 for record in records])  # (N, 2, 2), 1/m2
-        shares = np.trace(told, axis1=1, axis2=2)
-        told *= (shares / shares.sum())[:, None, None]
+        information = np.linalg.inv([r.covariance_m2 for r in records])  # (N, 2, 2), 1/m2
+        weights = np.trace(information, axis1=1, axis2=2)
+        information *= (weights / weights.sum())[:, None, None]
         innovations_m = np.array([r.innovation_m(self._estimate.__getitem__) for r in records])
-        covariance_m2 = np.linalg.inv(told.sum(axis=0))
-        mean_m = covariance_m2 @ np.einsum("nij,nj->i", told, innovations_m)
+        covariance_m2 = np.linalg.inv(information.sum(axis=0))
+        mean_m = covariance_m2 @ np.einsum("nij,nj->i", information, innovations_m)
         return innovations_m[0] - mean_m, covariance_m2
 
     def _one_range(self, records: list[RangeRecord]) -> RangeRecord:

@@ -42,9 +42,16 @@ def group(voyage: Voyage, tmp_path: Path) -> Iterator[ProcessGroup]:
 
 
 def lived(
-    group: ProcessGroup, voyage: Voyage, folder: Path, store: Path | None
+    group: ProcessGroup,
+    ending: threading.Thread,
+    voyage: Voyage,
+    folder: Path,
+    store: Path | None,
 ) -> BaseException | None:
-    """Run the leader's process to its end; return what ended it."""
+    """Run the leader's process to its end; return what ended it.
+
+    Once the first life has had all its instants, ending begins to end the mission.
+    """
     ended: list[BaseException] = []
 
     def live() -> None:
@@ -56,11 +63,11 @@ def lived(
 
     thread = threading.Thread(target=live, daemon=True)
     thread.start()
-    if not (folder / "out").exists():  # the first life is served its mission
+    if ending.ident is None:  # the first life is served its mission
         group.wait_for_all()
         for step in range(round(voyage.settings.scenario.duration_s / 0.25) + 1):
             group.nodes[0].tick(step * 0.25)
-        threading.Thread(target=group.end, daemon=True).start()
+        ending.start()
     thread.join(60.0)
     assert not thread.is_alive()
     return ended[0] if ended else None
@@ -78,10 +85,14 @@ def test_process_killed_after_its_last_instant_ends_the_mission_when_it_starts_a
         raise Killed
 
     store = tmp_path / "store" if has_store else None
+    ending = threading.Thread(target=group.end, daemon=True)
     with monkeypatch.context() as patch:
         patch.setattr(vehicle, "_write", killed)
-        assert isinstance(lived(group, voyage, tmp_path, store), Killed)
-    again = lived(group, voyage, tmp_path, store)
+        assert isinstance(lived(group, ending, voyage, tmp_path, store), Killed)
+        assert ending.is_alive()
+    again = lived(group, ending, voyage, tmp_path, store)
+    ending.join(60.0)
+    assert not ending.is_alive()  # else the group would be closed under it
     files = {path.name for path in (tmp_path / "out" / "processes").iterdir()}
     if has_store:
         assert again is None

@@ -1,6 +1,7 @@
 """`fathomlink simulate`: one mission from terrain to report."""
 
 import argparse
+import dataclasses
 import time
 from pathlib import Path
 from typing import Never
@@ -54,7 +55,6 @@ def simulate(
         record=record,
         progress=progress,
     )
-    close_stores([leader, *followers])
     mission = Mission(
         settings=settings,
         site=site,
@@ -64,7 +64,11 @@ def simulate(
         deliveries=deliveries,
         truth_map=truth_map,
     )
-    return mission_result(mission, leader, followers)
+    result = mission_result(mission, leader, followers)
+    if store is not None:  # the shelf is in the leader's
+        result = dataclasses.replace(result, patches=list(result.patches))
+        close_stores([leader, *followers])
+    return result
 
 
 def outcome_lines(evaluation: Evaluation) -> list[str]:

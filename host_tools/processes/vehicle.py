@@ -1,6 +1,7 @@
 """`fathomlink follower` and `fathomlink leader`: one vehicle, its loop on its modem's port."""
 
 import argparse
+import contextlib
 import dataclasses
 import datetime
 import itertools
@@ -115,9 +116,8 @@ def run_vehicle(
         aboard = _board(vehicle, starts, modem, clock, sealed, files, first_s, store)
         _sail(aboard, sailed, on_wall=isinstance(clock, WallClock))
         aboard.worker.close()
-        if isinstance(aboard.loop.core, Journaled):
-            aboard.loop.core.recorder.journal.close()
-        _write(aboard, voyage)
+        with _committed(aboard.loop.core):
+            _write(aboard, voyage)
         if isinstance(clock, ServedClock):
             clock.end()
     finally:
@@ -284,17 +284,30 @@ def start_time_s(text: str) -> float:
     return (moment if moment.tzinfo else moment.replace(tzinfo=datetime.UTC)).timestamp()
 
 
+@contextlib.contextmanager
+def _committed(core: LeaderCore | FollowerCore) -> Iterator[None]:
+    """Commit to a core's store, if it has one, and close it behind what reads from its shelf."""
+    journal = core.recorder.journal if isinstance(core, Journaled) else None
+    if journal is not None:
+        journal.commit()
+    try:
+        yield
+    finally:
+        if journal is not None:
+            journal.close()
+
+
 def _write(aboard: Aboard, voyage: Voyage) -> None:
     if aboard.files is None:
         print(_status_line(voyage.settings.scenario.duration_s, aboard.status()))
         return
-    aboard.files.write_counters(aboard.status())
     aboard.files.write_soundings(aboard.truth_map)
     core = aboard.loop.core
     if isinstance(core, LeaderCore):
         seconds = math.floor(voyage.settings.scenario.duration_s) + 1
         time_s = np.arange(0.0, seconds)
         aboard.files.write_record(leader_record(core, time_s, voyage.site.window))
+    aboard.files.write_counters(aboard.status())
 
 
 def _status_line(now_s: float, counters: dict[str, int]) -> str:

@@ -10,9 +10,13 @@ import pytest
 
 from firmware.belief import Belief
 from firmware.dead_reckoning import ReckonedState
+from firmware.leader.atlas import SheetId, sheet_of
+from firmware.leader.core import LeaderCore
+from firmware.submaps import GriddedSubmap, Track
 from host_tools.processes import vehicle
 from host_tools.processes.process_group import ProcessGroup
 from host_tools.processes.records import VehicleFiles
+from host_tools.processes.vehicle import Aboard
 from host_tools.processes.voyage import Voyage, add_voyage_arguments, voyage_of
 from protocol.acoustics import Water, WaterSettings
 from protocol.errors import ConfigError
@@ -116,3 +120,36 @@ def test_half_a_row_that_a_full_disk_left_spoils_no_later_one(tmp_path: Path) ->
     data = (tmp_path / "processes" / "leader.beliefs").read_bytes()
     times_s = np.frombuffer(data, dtype="<f8").reshape(4, -1)[:, 0]
     assert times_s.tolist() == [0.0, 1.0, 2.0, 3.0]
+
+
+def test_what_lies_on_the_shelf_of_a_store_is_in_the_record(
+    voyage: Voyage, group: ProcessGroup, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sail = vehicle._sail
+    grid = GriddedSubmap(
+        north0_m=0.0,
+        east0_m=0.0,
+        cell_m=2.0,
+        depth_m=np.full((5, 5), 30.0),
+        variance_m2=np.ones((5, 5)),
+        time_s=np.ones((5, 5)),
+    )
+    zeros = np.zeros(3)
+    track = Track(time_s=np.arange(3.0), north_m=zeros, east_m=zeros, yaw_rad=zeros)
+    sheet = sheet_of(SheetId(vehicle=0, boot_epoch=0, submap=1), track, grid, reconstructed=False)
+
+    def sail_and_shelve(aboard: Aboard, ticks: Iterator[float], *, on_wall: bool) -> None:
+        sail(aboard, ticks, on_wall=on_wall)
+        core = aboard.loop.core
+        assert isinstance(core, LeaderCore)
+        assert sheet is not None
+        core.atlas.add(sheet)
+        core.atlas.shelve(sheet.id)
+
+    monkeypatch.setattr(vehicle, "_sail", sail_and_shelve)
+    ending = threading.Thread(target=group.end, daemon=True)
+    assert lived(group, ending, voyage, tmp_path, tmp_path / "store") is None
+    ending.join(60.0)
+    assert not ending.is_alive()
+    patches = list(VehicleFiles(tmp_path / "out", 0).record().patches)
+    assert any((patch.depth_m == 30.0).all() for patch in patches)

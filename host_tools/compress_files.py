@@ -57,9 +57,10 @@ def compress_file(
     settings = _with_frames(settings, profile, frames, small)
     bins = SoundingBins(BinningSettings())
     bins.add(np.column_stack(columns[:3]), columns[3])
+    cells = bins.result()
     quarters = round(4.0 * float(track.time_s[0])) % (1 << 20)
     try:
-        compressed = compress(bins.result(), settings, profile)
+        compressed = compress(cells, settings, profile)
         packets = packets_from(compressed, track, submap_header(time_quarters=quarters))
         data = b"".join(encode(packet) for packet in packets)
     except (EstimationError, ProtocolError) as error:
@@ -69,7 +70,7 @@ def compress_file(
     _write(out, data)
     report = compressed.report
     return (
-        f"{bins.soundings} soundings in {len(bins.result().count)} cells, {len(packets)} frames, "
+        f"{bins.soundings} soundings in {len(cells.count)} cells, {len(packets)} frames, "
         f"{len(data)} bytes; {bins.dropped_bad} bad and {bins.dropped_fliers} wild soundings "
         f"dropped; fit: {report.ended} after {report.evaluations} evaluations, "
         f"{report.failed_factorisations} failed factorisations"

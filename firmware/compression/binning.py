@@ -43,7 +43,8 @@ class SoundingBins:
         self._waiting_count = 0
         self._sigma_m = np.inf  # gate of the sums, known once reservoirs fill
         self.dropped_bad = 0
-        self.dropped_fliers = 0
+        self.dropped_fliers = 0  # as of the last result
+        self._late_fliers = 0
         self.coarsened = 0
         self.soundings = 0
 
@@ -116,7 +117,7 @@ class SoundingBins:
             centre_m = _median(self._held[rows[late]])
             gate_m = 2.0 * self._settings.flier_gate * self._sigma_m
             near[late] = np.abs(offset_m[late] - centre_m) <= gate_m
-            self.dropped_fliers += int(np.count_nonzero(~near))
+            self._late_fliers += int(np.count_nonzero(~near))
         late &= near
         if late.any():
             columns = (
@@ -193,7 +194,7 @@ class SoundingBins:
         gate_m = self._settings.flier_gate * np.hypot(spread_m, sigma_m)
         with np.errstate(invalid="ignore"):
             near = np.abs(held_m - centre_m[:, None]) <= gate_m[:, None]
-        self.dropped_fliers += int(np.count_nonzero(np.isfinite(held_m) & ~near))
+        fliers = self._late_fliers + int(np.count_nonzero(np.isfinite(held_m) & ~near))
         sums_near = (
             np.abs(
                 self._reference_m + self._sums[:, 0] / np.maximum(self._sums[:, 2], 1.0) - centre_m
@@ -206,7 +207,7 @@ class SoundingBins:
         total = offset.sum(axis=1) + np.where(sums_near, self._sums[:, 0], 0.0)
         squares = (offset**2).sum(axis=1) + np.where(sums_near, self._sums[:, 1], 0.0)
         lone = self._lone(self._filled + self._sums[:, 2])
-        self.dropped_fliers += int(count[lone].sum())
+        self.dropped_fliers = fliers + int(count[lone].sum())
         kept = (count > 0) & ~lone
         count = np.maximum(count, 1.0)
         mean = total / count

@@ -78,6 +78,16 @@ def test_depth_of_the_sea_does_not_matter(
     assert np.isfinite(depth_m).mean() > 0.7
 
 
+def test_wild_soundings_are_counted_once(survey: Survey, tmp_path: Path) -> None:
+    soundings_ned_m = survey.soundings_ned_m.copy()
+    soundings_ned_m[::500, 2] += 20.0
+    soundings = saved(tmp_path / "s.npz", soundings_ned_m, survey.time_s)
+    line = compress_file(soundings, tmp_path / "f.bin", "lattice", settings=QUICK)
+    found = re.search(r"(\d+) wild soundings", line)
+    assert found is not None
+    assert int(found[1]) < 1.2 * len(soundings_ned_m) / 500
+
+
 # hardly any depth of pseudo points is then as certain as the leader keeps
 UNCERTAIN = {
     "fewer soundings than points": {"dense"},

@@ -2,6 +2,8 @@
 
 import argparse
 import dataclasses
+import zipfile
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -33,6 +35,7 @@ from protocol.settings import replace
 _SOUNDINGS = ("north_m", "east_m", "depth_m", "time_s")
 _TRACK = ("track_time_s", "track_north_m", "track_east_m", "track_yaw_rad")
 _MOST_STATES = 40
+_LATEST_S = 1e11  # three thousand years; UTC has 2e9
 _MOST_BYTES = 1 << 20  # of a file of frames: a sub-map has 2,560
 
 
@@ -156,11 +159,13 @@ def read_soundings(path: Path) -> tuple[list[Array], Track]:
         When the file is no npz of these arrays, or they disagree.
     """
     try:
-        with np.load(path) as data:
+        with path.open("rb") as stream, np.load(stream) as data:
             names = [name for name in (*_SOUNDINGS, *_TRACK) if name in data.files]
             arrays = {name: data[name].astype(np.float64, casting="same_kind") for name in names}
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror or error}") from error
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
+        raise ConfigError(f"{path} is damaged or no npz: {error}") from error
     except (ValueError, KeyError, EOFError, TypeError, AttributeError) as error:
         raise ConfigError(f"{path} is not an npz of numeric arrays: {error}") from error
     missing = [name for name in _SOUNDINGS if name not in arrays]
@@ -184,6 +189,11 @@ def read_soundings(path: Path) -> tuple[list[Array], Track]:
             f"{path}: depths of {depth_m:.0f} m; give metres, positive down, from {HIGHEST_M:.0f} "
             f"to {DEEPEST_M:.0f}"
         )
+    for name in ("time_s", "track_time_s"):
+        times_s = np.abs(arrays.get(name, np.zeros(1)))
+        latest_s = float(np.max(times_s, where=np.isfinite(times_s), initial=0.0))
+        if latest_s > _LATEST_S:
+            raise ConfigError(f"{path}: {name} of {latest_s:g} s; give seconds, UTC or less")
     given = [name for name in _TRACK if name in arrays]
     if given and len(given) < len(_TRACK):
         raise ConfigError(f"{path} has {given[0]} but not all of {', '.join(_TRACK)}")

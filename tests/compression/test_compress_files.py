@@ -212,6 +212,32 @@ def test_soundings_of_which_no_map_can_be_made_are_refused(
         compress_file(saved(tmp_path / "s.npz", soundings), tmp_path / "f.bin", "paper")
 
 
+@pytest.mark.parametrize("damage", ["cut", "flipped", "torn"])
+def test_damaged_soundings_are_told(damage: str, survey: Survey, tmp_path: Path) -> None:
+    soundings = saved(tmp_path / "s.npz", survey.soundings_ned_m, survey.time_s)
+    if damage == "torn":  # within what is compressed
+        with np.load(soundings) as arrays:
+            np.savez_compressed(soundings, **arrays)
+    data = bytearray(soundings.read_bytes())
+    data[400:420] = bytes(20) if damage == "torn" else bytes(b ^ 0xFF for b in data[400:420])
+    soundings.write_bytes(data[: len(data) // 2] if damage == "cut" else data)
+    with pytest.raises(ConfigError, match=r"s\.npz is damaged or no npz"):
+        compress_file(soundings, tmp_path / "f.bin", "lattice")
+
+
+@pytest.mark.parametrize("name", ["time_s", "track_time_s"])
+def test_times_that_are_none_are_refused(name: str, survey: Survey, tmp_path: Path) -> None:
+    north_m, east_m, depth_m = survey.soundings_ned_m.T
+    columns = {"north_m": north_m, "east_m": east_m, "depth_m": depth_m, "time_s": survey.time_s}
+    track = {"track_time_s": np.arange(2.0), "track_north_m": np.arange(2.0)}
+    track |= {"track_east_m": np.arange(2.0), "track_yaw_rad": np.zeros(2)}
+    wild = {**columns, **track}
+    wild[name] = wild[name] * 1e300
+    np.savez(tmp_path / "s.npz", **wild)
+    with pytest.raises(ConfigError, match=rf"{name} of \S+ s; give seconds"):
+        compress_file(tmp_path / "s.npz", tmp_path / "f.bin", "lattice")
+
+
 @pytest.mark.parametrize("other", [np.array("a note"), np.array([None]), np.array([1j])])
 def test_arrays_beside_the_soundings_are_left_alone(
     other: Array, survey: Survey, tmp_path: Path

@@ -9,13 +9,18 @@ USER0, USER1 = 147, 148
 """Link types of pcap for private use: bare frames; frames behind three bytes of the medium."""
 FATES = ("delivered", "lost", "collision", "half-duplex", "corrupt", "duplicate", "out-of-reach")
 OTHER_FATE = 255
+LATEST_S = 2.0**32 - 1.0
+"""Times of a capture are seconds of four bytes."""
 _FILE = struct.Struct("<IHHiIII")
 _RECORD = struct.Struct("<IIII")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Captured:
-    """A frame at a time in seconds; node and fate are None where nothing is known of the medium."""
+    """A frame at a time in seconds, 0 to LATEST_S.
+
+    Node and fate are None where nothing is known of the medium.
+    """
 
     time_s: float
     frame: bytes

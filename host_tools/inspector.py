@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from host_tools.capture import Captured, write_pcap
+from host_tools.capture import LATEST_S, Captured, write_pcap
 from host_tools.commands import Command
 from protocol.codec import decode
 from protocol.errors import ConfigError, RemoteProtocolError
@@ -76,11 +76,13 @@ def _read_air(path: Path, data: bytes) -> Iterator[tuple[str, Captured]]:
                 destination=int(record["destination"]),
                 fate=str(record["fate"]),
             )
+            if not 0.0 <= captured.time_s < LATEST_S:
+                raise ValueError(f"a frame at {captured.time_s:g} s")
             head = (
                 f"{record['t_tx_s']:10.3f} s  {record['source']} -> {record['destination']}"
                 f"  {record['fate']:<11}"
             )
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
             raise ConfigError(
                 f"{path}, line {number}: not a line of air.jsonl ({error})"
             ) from error

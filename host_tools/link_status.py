@@ -71,14 +71,19 @@ def _counters(folder: Path) -> dict[str, Mapping[str, float]]:
     """Return counters by vehicle: of a finished mission, or of processes that run or have died."""
     summary, processes = folder / "summary.json", folder / FOLDER
     if summary.exists() and not processes.exists():
-        return dict(_json(summary).get("counters", {}))
+        counters = _json(summary).get("counters", {})
+        if not isinstance(counters, dict) or not all(
+            isinstance(v, dict) for v in counters.values()
+        ):
+            raise ConfigError(f"{summary} holds no counters; give the folder of a mission")
+        return counters
     return {path.stem: _json(path) for path in sorted(processes.glob("*.json"))}
 
 
 def _json(path: Path) -> dict[str, Any]:
     try:
         values = json.loads(path.read_text(encoding="ascii"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(
             f"{path} cannot be read ({error}); the mission has to write it"
         ) from error
@@ -119,15 +124,23 @@ def _store_line(path: Path) -> str:
     size_kb = path.stat().st_size / 1000.0
     if path.suffix == ".counter":
         marks = path.with_suffix(".marks")
-        heard = DISK.read(marks).strip() if marks.exists() else "{}"
-        reserved = DISK.read(path).strip()
+        heard = _kept(marks) if marks.exists() else "{}"
+        reserved = _kept(path)
         return (
             f"{path.stem}: counters reserved up to {reserved}, highest accepted by sender {heard}"
         )
     epoch = path.with_suffix(".epoch")
     aside = len(list(path.parent.glob(f"{path.stem}.aside-*.sqlite")))
-    told = DISK.read(epoch).strip() if epoch.exists() else "unknown"
+    told = _kept(epoch) if epoch.exists() else "unknown"
     return f"{path.name}: {size_kb:.0f} kB, boot epoch {told}, {aside} earlier ones set aside"
+
+
+def _kept(path: Path) -> str:
+    """Return what a small file of a store says, or that it is damaged."""
+    try:
+        return DISK.read(path).strip()
+    except UnicodeDecodeError:
+        return "(damaged)"
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:

@@ -218,7 +218,7 @@ def load_scenario(name_or_path: str) -> ScenarioSettings:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"cannot read scenario {path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigError(f"{path} is not a TOML file: {error}") from error
     base = named_scenario(str(table.pop("base", "paper-1")))
     water = table.pop("water", {})

@@ -3,7 +3,7 @@
 import argparse
 from functools import partial
 
-from host_tools.commands import Command, count
+from host_tools.commands import Command, count, seed
 from host_tools.emulators.run import KINDS, EmulationSettings, emulate
 
 
@@ -13,7 +13,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--range", type=float, default=500.0, metavar="M", help="metres between neighbours"
     )
-    parser.add_argument("--seed", type=int, default=1, help="of loss and noise")
+    parser.add_argument("--seed", type=seed, default=1, help="of loss and noise")
 
 
 def _run(arguments: argparse.Namespace) -> None:

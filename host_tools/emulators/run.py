@@ -23,6 +23,7 @@ from protocol.acoustics import Position, Water, WaterSettings
 from protocol.errors import ConfigError
 
 KINDS = ("micromodem", "nanomodem")
+FARTHEST_M = 100e3
 LONGEST_NAP_S = 0.05
 """How long the loop may sleep while nothing happens; a host's bytes wake it at once."""
 
@@ -52,6 +53,10 @@ class Emulation:
             raise ConfigError(f"no emulator {settings.kind!r}; known are {', '.join(KINDS)}")
         if not 2 <= settings.nodes <= 15:
             raise ConfigError(f"{settings.nodes} nodes; give 2 to 15")
+        if not 0.0 <= settings.range_m <= FARTHEST_M:
+            raise ConfigError(
+                f"{settings.range_m:g} m between neighbours; give 0 to {FARTHEST_M:g}"
+            )
         self.settings = settings
         nodes = range(1, settings.nodes + 1)
         rng = np.random.default_rng(settings.seed)

@@ -132,11 +132,15 @@ class ModemUrl:
     @classmethod
     def parse(cls, text: str) -> "ModemUrl":
         """Return the parts of a URL such as serial:///dev/ttyUSB0?baud=19200."""
-        parts = urlsplit(text)
+        wrong = ConfigError(
+            f"modem {text!r} is no URL; write e.g. serial:///dev/ttyUSB0?baud=19200"
+        )
+        try:
+            parts = urlsplit(text)
+        except ValueError as error:
+            raise wrong from error
         if "://" not in text:
-            raise ConfigError(
-                f"modem {text!r} is no URL; write e.g. serial:///dev/ttyUSB0?baud=19200"
-            )
+            raise wrong
         query = dict(parse_qsl(parts.query, keep_blank_values=True))
         return cls(text=text, scheme=parts.scheme, path=parts.netloc + parts.path, query=query)
 

@@ -22,6 +22,7 @@ from protocol.modems.base import (
 )
 
 DEFAULT_BAUD = 19_200
+SLOWEST_BAUD, FASTEST_BAUD = 300, 4_000_000
 REOPEN_S = 1.0
 """Between attempts to reopen: fast enough for a plug pulled and put back, no load when it stays."""
 READ_BYTES = 4096
@@ -170,12 +171,18 @@ def open_serial(url: ModemUrl, context: ModemContext) -> Modem:
 
     Raises
     ------
+    ConfigError
+        For a URL without a port, an unknown option, or a baud that is none.
     ModemUnavailable
         When the port is not there, not ours to open, or in use.
     """
     options = url.options({"baud": DEFAULT_BAUD})
     if not url.path:
         raise ConfigError(f"{url.text} names no port; write e.g. serial:///dev/ttyUSB0?baud=19200")
+    if not SLOWEST_BAUD <= options["baud"] <= FASTEST_BAUD:
+        raise ConfigError(
+            f"{url.text}: baud is {options['baud']}; give {SLOWEST_BAUD} to {FASTEST_BAUD}"
+        )
     return SerialLineModem(url.path, options["baud"], context.tap)
 
 

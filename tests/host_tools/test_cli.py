@@ -105,7 +105,14 @@ def test_bad_input_is_one_line_and_status_2(
 
 
 @pytest.mark.parametrize(
-    "arguments", [["swim"], ["inspect"], ["config", "show", "--loss", "much"], []]
+    "arguments",
+    [
+        ["swim"],
+        ["inspect"],
+        ["config", "show", "--loss", "much"],
+        ["emulate", "nanomodem", "--seed", "-1"],
+        [],
+    ],
 )
 def test_unreadable_arguments_are_one_line_and_status_2(
     arguments: list[str], capsys: pytest.CaptureFixture[str]
@@ -170,7 +177,13 @@ def test_inspect_reads_air_and_says_why_a_frame_is_dropped(
     assert "CRC" in second
 
 
-@pytest.mark.parametrize("content", [None, b"", b'{"t_tx_s": 1}\n'])
+AIR = b'{"t_tx_s": 1.0, "t_rx_s": null, "source": %s, "destination": 0, "hex": "", "fate": ""}'
+
+
+@pytest.mark.parametrize(
+    "content",
+    [None, b"", b'{"t_tx_s": 1}\n', b'{"a":' + b"[" * 100_000, AIR % b"Infinity", AIR % b"NaN"],
+)
 def test_inspect_refuses_what_is_no_file_of_frames(
     tmp_path: Path, content: bytes | None, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -89,7 +89,10 @@ def test_a_finished_simulation_is_read_from_its_summary(tmp_path: Path) -> None:
     ]
 
 
-@pytest.mark.parametrize("content", [None, "", "[1]", "{"])
+@pytest.mark.parametrize(
+    "content",
+    [None, "", "[1]", "{", "[" * 100_000, '{"counters": 5}', '{"counters": {"leader": 5}}'],
+)
 def test_a_folder_without_a_mission_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], content: str | None
 ) -> None:
@@ -97,6 +100,13 @@ def test_a_folder_without_a_mission_is_one_line(
         (tmp_path / "summary.json").write_text(content)
     assert main(["link", "status", str(tmp_path)]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("suffix", ["counter", "marks"])
+def test_a_damaged_file_of_a_store_is_told(tmp_path: Path, suffix: str) -> None:
+    (tmp_path / "seal_1.counter").write_text("64\n")
+    (tmp_path / f"seal_1.{suffix}").write_bytes(b"\xff\xfe")
+    assert "damaged" in next(status_lines(tmp_path))
 
 
 def test_numbers_and_addresses_given_twice_are_told_with_what_to_do() -> None:

@@ -56,6 +56,7 @@ def test_toml_file_changes_its_base(tmp_path: Path) -> None:
         ("duration_min = true", "bad.toml: duration_min is True; give a value of type float"),
         ("beams = false", "bad.toml: beams is False; give a value of type int"),
         ("leg_m = [", "is not a TOML file"),
+        ("leg_m = " + "[" * 5000 + "]" * 5000, "is not a TOML file"),
         ("leg_m = 1", "at least 20"),
         ("base = 'paper-3'", "choose one of paper-1, paper-2, field-1, day-1"),
         ("line_spacing_m = 12", "needs at least 23.6 m"),
@@ -80,6 +81,8 @@ def test_unknown_scenario_names_the_choices() -> None:
         load_scenario("papper-1")
     with pytest.raises(ConfigError, match="cannot read scenario"):
         load_scenario("missing.toml")
+    with pytest.raises(ConfigError, match="null"):
+        load_scenario("a\0b.toml")
 
 
 def test_setting_survey_position_as_text_pairs_both() -> None:

@@ -143,7 +143,9 @@ def test_ports_are_raw_so_that_no_byte_is_changed() -> None:
     port.close()
 
 
-@pytest.mark.parametrize("settings", [{"kind": "janus"}, {"nodes": 1}, {"nodes": 16}])
+@pytest.mark.parametrize(
+    "settings", [{"kind": "janus"}, {"nodes": 1}, {"nodes": 16}, {"range_m": float("nan")}]
+)
 def test_an_emulation_that_cannot_be_is_refused(settings: dict[str, object]) -> None:
     with pytest.raises(ConfigError):
         Emulation(EmulationSettings(**settings))  # type: ignore[arg-type]

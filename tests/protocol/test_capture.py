@@ -12,6 +12,7 @@ from host_tools import dissector
 from host_tools.inspector import inspect_file, write_capture
 from protocol import vectors
 from protocol.codec import encode
+from protocol.errors import ConfigError
 
 SCRIPT = dissector.FOLDER / "fathomlink.lua"
 
@@ -56,6 +57,13 @@ def test_a_file_of_frames_is_split_and_what_is_no_frame_stays_visible(tmp_path: 
     assert "7 bytes that are no frame" in lines[0]
     assert "submap paper" in lines[1]
     assert write_capture(path, tmp_path / "out.pcap") == 4
+
+
+@pytest.mark.parametrize("time_s", ["NaN", "Infinity", "-5.0", "1e30"])
+def test_a_time_that_is_none_is_named_with_its_line(air: Path, tmp_path: Path, time_s: str) -> None:
+    air.write_text(air.read_text().replace("90.0", time_s))
+    with pytest.raises(ConfigError, match=rf"line {len(frames()) + 1}: not a line of air.jsonl"):
+        write_capture(air, tmp_path / "out.pcap")
 
 
 def test_tshark_reads_every_field(air: Path, tmp_path: Path) -> None:

@@ -112,6 +112,9 @@ def test_an_unknown_scheme_names_the_known_ones() -> None:
         ("serial://", "names no port"),
         ("serial:///dev/ttyUSB0?bauds=9600", "unknown option 'bauds'; known are baud"),
         ("serial:///dev/ttyUSB0?baud=fast", "baud is 'fast'; give a whole number"),
+        ("serial:///dev/ptmx?baud=-5", "baud is -5; give 300 to 4000000"),
+        ("serial:///dev/ptmx?baud=99999999999999999999", "give 300 to 4000000"),
+        ("serial://[x", "is no URL; write e.g."),
         ("loopback://?node=1", "works inside one process only"),
     ],
 )

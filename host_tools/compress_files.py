@@ -36,6 +36,7 @@ _SOUNDINGS = ("north_m", "east_m", "depth_m", "time_s")
 _TRACK = ("track_time_s", "track_north_m", "track_east_m", "track_yaw_rad")
 _MOST_STATES = 40
 _LATEST_S = 1e11  # three thousand years; UTC has 2e9
+_ANY_VARIANCE_M2 = 1e30
 _MOST_BYTES = 1 << 20  # of a file of frames: a sub-map has 2,560
 
 
@@ -136,7 +137,7 @@ def _why_no_cell(
 ) -> str:
     """Return why a rebuilt grid is empty, and what would fill it."""
     most_m2 = settings.max_variance_m2
-    uncut = replace(settings, {"max_variance_m2": np.inf})
+    uncut = replace(settings, {"max_variance_m2": _ANY_VARIANCE_M2})
     variance_m2 = reconstruct_packets(fragments, uncut, 0.0).grid.variance_m2
     if not np.isfinite(variance_m2).any():
         return (

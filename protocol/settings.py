@@ -7,6 +7,7 @@ Every room declares its own settings beside the code that reads them; `firmware.
 
 import dataclasses
 import difflib
+import math
 import types
 import typing
 from collections.abc import Iterator, Mapping
@@ -41,7 +42,7 @@ def setting(
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """Base of all settings trees; checks every field against its declared bounds."""
+    """Base of all settings trees; checks that every field is finite and in its declared bounds."""
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -56,8 +57,9 @@ def _check(field: "dataclasses.Field[Any]", value: object) -> None:
         raise ConfigError(f"{field.name} is {value!r}; choose one of {', '.join(choices)}")
     if isinstance(value, bool) or not isinstance(value, int | float):
         return
-    if value != value:  # noqa: PLR0124  NaN compares unequal to itself
-        raise ConfigError(f"{field.name} is NaN; give a number in {unit}")
+    if isinstance(value, float) and not math.isfinite(value):
+        of_it = f" in {unit}" if unit else ""
+        raise ConfigError(f"{field.name} is {value}; give a finite number{of_it}")
     shown = f"{field.name} is {value} {unit}".rstrip()
     if minimum is not None and value < minimum:
         raise ConfigError(f"{shown}; it must be at least {minimum}")
@@ -141,6 +143,6 @@ def _read(name: str, value: object, kind: Any) -> object:  # noqa: ANN401
         if kind is int and not isinstance(value, str) and value != int(value):  # type: ignore[call-overload]
             raise ValueError
         return kind(value)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         wanted = getattr(kind, "__name__", str(kind))
         raise ConfigError(f"{name} is {value!r}; give a value of type {wanted}") from error

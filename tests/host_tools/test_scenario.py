@@ -57,6 +57,8 @@ def test_toml_file_changes_its_base(tmp_path: Path) -> None:
         ("beams = false", "bad.toml: beams is False; give a value of type int"),
         ("leg_m = [", "is not a TOML file"),
         ("leg_m = " + "[" * 5000 + "]" * 5000, "is not a TOML file"),
+        ("followers = inf", "followers is inf; give a value of type int"),
+        ("leg_m = 1" + "0" * 400, "give a value of type float"),
         ("leg_m = 1", "at least 20"),
         ("base = 'paper-3'", "choose one of paper-1, paper-2, field-1, day-1"),
         ("line_spacing_m = 12", "needs at least 23.6 m"),

@@ -23,6 +23,7 @@ from host_tools.mapping import DepthMap
 from host_tools.nodes import ROW_NUMBERS, belief_columns, belief_row
 from host_tools.results import ClosureResult, Counters, SoundingPatch
 from protocol.errors import ConfigError
+from protocol.seal_state import write_durably
 from protocol.vehicles import name_of
 
 FOLDER = "processes"
@@ -37,14 +38,18 @@ class VehicleFiles:
     def __init__(self, out: Path, vehicle: int) -> None:
         self.folder, self.name = out / FOLDER, name_of(vehicle)
 
-    def prepare(self) -> int:
-        """Make the folder and return how often this vehicle has started before in it."""
+    def prepare(self) -> int | None:
+        """Make the folder and return how often this vehicle has started before in it.
+
+        None where the count is damaged; it stays so, lest a number be given twice.
+        """
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self._path("starts")
-        starts = int(path.read_text(encoding="ascii")) if path.exists() else 0
-        whole = self._path("starts.new")
-        whole.write_text(str(starts + 1), encoding="ascii")
-        whole.replace(path)  # at once: a kill or a full disk leaves the old count
+        try:
+            starts = int(path.read_text(encoding="ascii")) if path.exists() else 0
+        except ValueError:
+            return None
+        write_durably(path, str(starts + 1))
         return starts
 
     def forget(self) -> None:

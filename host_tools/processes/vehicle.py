@@ -95,8 +95,8 @@ def run_vehicle(
         vehicle, modem_url, clock_url, voyage, start, seal, must_answer=not is_at_sea
     )
     files = None if out is None else VehicleFiles(out, vehicle)
-    starts = None if files is None else files.prepare()
     try:
+        starts = None if files is None else files.prepare()
         follower = voyage.settings.follower
         check_frame_size(modem.largest_frame_bytes, follower.frame_bytes, follower.profile)
         ticks = clock.ticks(voyage.tick_s)
@@ -169,7 +169,7 @@ def _board(
 ) -> Aboard:
     """Return the vehicle with core, loop and sensors as of its first tick.
 
-    starts is how often it started before; None where that is not kept, and the clock tells boots.
+    starts is how often it started before; None where nobody knows, and the clock tells boots.
     """
     truth_map = DepthMap(voyage.site.window)
     simulated = SimulatedVehicle(

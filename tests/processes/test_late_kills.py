@@ -153,3 +153,11 @@ def test_what_lies_on_the_shelf_of_a_store_is_in_the_record(
     assert not ending.is_alive()
     patches = list(VehicleFiles(tmp_path / "out", 0).record().patches)
     assert any((patch.depth_m == 30.0).all() for patch in patches)
+
+
+def test_starts_are_counted_and_by_the_clock_where_the_count_is_damaged(tmp_path: Path) -> None:
+    files = VehicleFiles(tmp_path, 0)
+    assert [files.prepare(), files.prepare()] == [0, 1]
+    for damage in (b"", b"two", b"\xff"):
+        (tmp_path / "processes" / "leader.starts").write_bytes(damage)
+        assert [files.prepare(), files.prepare()] == [None, None]

@@ -4,6 +4,7 @@ import argparse
 import shlex
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Never
 
@@ -24,7 +25,7 @@ from host_tools.report import write_report
 from host_tools.results import MissionResult
 from host_tools.simulate import outcome_lines
 from host_tools.simulator.vehicle import SimulatedVehicle
-from host_tools.writers import prepare_folder, write_outputs
+from host_tools.writers import prepare_folder, write_air, write_outputs
 from protocol.acoustics import Delivery
 
 Ready = Callable[[ProcessGroup], None]
@@ -81,20 +82,26 @@ def host_mission(
             )
         group.end()
         lines = {f"line_{node.name}": node.status() for node in group.nodes.values()}
-    return _result(voyage, vehicles, files, deliveries, lines)
+    return result_of_files(voyage, vehicles, out, deliveries, lines)
 
 
-def _result(
+def result_of_files(
     voyage: Voyage,
     vehicles: Sequence[SimulatedVehicle],
-    files: dict[int, VehicleFiles],
+    out: Path,
     deliveries: list[Delivery],
     lines: dict[str, dict[str, int]],
 ) -> MissionResult:
+    """Return a mission from the files in out, as far as its vehicles lived to write them.
+
+    Writes the air there first. Raises ConfigError where a vehicle left no beliefs.
+    """
+    write_air(deliveries, prepare_folder(out) / "air.jsonl")
+    files = {vehicle.index: VehicleFiles(out, vehicle.index) for vehicle in vehicles}
     truth_map = DepthMap(voyage.site.window)
     for each in files.values():
         each.add_soundings(truth_map)
-    return result_of_record(
+    result = result_of_record(
         Mission(
             settings=voyage.settings,
             site=voyage.site,
@@ -107,6 +114,7 @@ def _result(
         files[0].record(),
         {**{each.name: each.counters() for each in files.values()}, **lines},
     )
+    return replace(result, remarks=[*result.remarks, *missing_lines(result, out)])
 
 
 def vehicle_command(group: ProcessGroup, node: RemoteNode, voyage: Voyage, out: Path) -> list[str]:
@@ -128,7 +136,8 @@ def finish(result: MissionResult, out: Path, *, report: bool = True) -> list[str
     write_outputs(result, evaluation, out)
     if report:
         write_report(result, evaluation, out / "report.html")
-    return [*outcome_lines(evaluation), *failure_lines(result, out)]
+    missing = missing_lines(result, out)
+    return [*outcome_lines(evaluation), *failure_lines(result, out), *missing]
 
 
 def failure_lines(result: MissionResult, out: Path) -> list[str]:
@@ -138,6 +147,16 @@ def failure_lines(result: MissionResult, out: Path) -> list[str]:
         for owner, counters in result.counters.items()
         for name, count in counters.items()
         if name.endswith("_failed")
+    ]
+
+
+def missing_lines(result: MissionResult, out: Path) -> list[str]:
+    """Return a line for every vehicle whose process was not there to write all of its files."""
+    all_files = [VehicleFiles(out, vehicle.vehicle) for vehicle in result.vehicles]
+    return [
+        f"{files.name} left no {', '.join(missing)}: its process was not there at the end"
+        for files in all_files
+        if (missing := files.missing())
     ]
 
 

@@ -6,11 +6,12 @@ counters; `NAME.soundings.npz`, what the simulated sonar measured, placed by tru
 the map's truth; and of the leader `leader.npz`, its trajectories, closures and sheets.
 """
 
+import contextlib
 import dataclasses
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from host_tools.nodes import ROW_NUMBERS, belief_columns, belief_row
 from host_tools.results import ClosureResult, Counters, SoundingPatch
 from protocol.errors import ConfigError
 from protocol.seal_state import write_durably
-from protocol.vehicles import name_of
+from protocol.vehicles import LEADER, name_of
 
 FOLDER = "processes"
 _ROW_BYTES = 8 * ROW_NUMBERS
@@ -83,19 +84,30 @@ class VehicleFiles:
 
     def write_counters(self, counters: Counters) -> None:
         """Write the counters."""
-        self._path("json").write_text(json.dumps(counters, indent=1) + "\n", encoding="ascii")
+        with self._whole("json") as stream:
+            stream.write(json.dumps(counters, indent=1).encode() + b"\n")
+
+    def missing(self) -> list[str]:
+        """Return the names of the files that the vehicle's process did not live to write."""
+        suffixes = ["json", "soundings.npz"] + ["npz"] * (self.name == name_of(LEADER))
+        return [path.name for path in map(self._path, suffixes) if not path.exists()]
 
     def counters(self) -> dict[str, float]:
-        """Return the counters."""
+        """Return the counters, none if they are missing."""
+        if not self._path("json").exists():
+            return {}
         counters: dict[str, float] = json.loads(self._path("json").read_text(encoding="ascii"))
         return counters
 
     def write_soundings(self, truth_map: DepthMap) -> None:
         """Write what the sonar measured."""
-        np.savez(self._path("soundings.npz"), sums=truth_map.sums)
+        with self._whole("soundings.npz") as stream:
+            np.savez(stream, sums=truth_map.sums)
 
     def add_soundings(self, truth_map: DepthMap) -> None:
-        """Add what the sonar measured to a map."""
+        """Add what the sonar measured to a map, if it is there."""
+        if not self._path("soundings.npz").exists():
+            return
         with np.load(self._path("soundings.npz")) as arrays:
             truth_map.add_sums(arrays["sums"])
 
@@ -111,15 +123,14 @@ class VehicleFiles:
             arrays[f"patch.{patch.vehicle}.{k}"] = columns
         closures = [dataclasses.asdict(closure) for closure in record.closures]
         seen = json.dumps({"quantities": record.quantities, "remarks": record.remarks})
-        np.savez(
-            self._path("npz"),
-            closures=np.array(json.dumps(closures)),
-            seen=np.array(seen),
-            **arrays,
-        )
+        arrays |= {"closures": np.array(json.dumps(closures)), "seen": np.array(seen)}
+        with self._whole("npz") as stream:
+            np.savez(stream, **arrays)
 
     def record(self) -> LeaderRecord:
-        """Return what the leader holds."""
+        """Return what the leader holds, nothing if it is missing."""
+        if not self._path("npz").exists():
+            return LeaderRecord(trajectories={}, covariances_m2={}, closures=[], patches=[])
         with np.load(self._path("npz")) as arrays:
             vehicles = [int(k.split(".")[1]) for k in arrays.files if k.startswith("covariances.")]
             return LeaderRecord(
@@ -138,6 +149,15 @@ class VehicleFiles:
                 if key.startswith("patch."):
                     columns = dict(zip(_PATCH, arrays[key], strict=True))
                     yield SoundingPatch(vehicle=int(key.split(".")[1]), **columns)
+
+    @contextlib.contextmanager
+    def _whole(self, suffix: str) -> Iterator[BinaryIO]:
+        """Give a file to write that has its name once it is whole."""
+        path = self._path(suffix)
+        fresh = path.with_name(path.name + ".new")
+        with fresh.open("wb") as stream:
+            yield stream
+        fresh.replace(path)
 
     def _path(self, suffix: str) -> Path:
         return self.folder / f"{self.name}.{suffix}"

@@ -153,7 +153,11 @@ class SimulatedVehicle:
     def _fix(self, time_s: float) -> Fix | None:
         """Return the fix that the leader has at an instant; it dives on as if it had not risen."""
         every_s = 60.0 * self._scenario.gnss_fix_every_min
-        if self.index != 0 or not every_s or not time_s or time_s % every_s:
+        if self.index != 0 or not every_s:
+            return None
+        last_s = time_s - self._scenario.tick_s
+        last, now = (math.floor(at_s / every_s + 1e-9) for at_s in (last_s, time_s))
+        if not time_s or now == last:
             return None
         north_m, east_m = self._errors.fix_m(np.array(self.true_position(time_s)[:2]))
         return Fix(

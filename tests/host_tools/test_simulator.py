@@ -125,6 +125,21 @@ def test_pings_come_at_their_rate_and_navigation_on_whole_seconds_too(
         np.testing.assert_allclose(pings_s, due_s, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("every_min", "times_s"),
+    [(4.0, [240.0, 480.0]), (4.1, [246.0, 492.0]), (3.99, [239.5, 479.0]), (0.0, [])],
+)
+def test_fixes_come_at_the_first_tick_that_they_are_due(
+    every_min: float, times_s: list[float]
+) -> None:
+    scenario = replace(
+        named_scenario("paper-1"),
+        {"gnss_fix_every_min": every_min, "duration_min": 10, "beams": 2, "ping_hz": 2},
+    )
+    vehicle = SimulatedVehicle(scenario, hilly_seabed(), 0, 1)
+    assert [step.time_s for step, _ in vehicle.steps() if step.fix is not None] == times_s
+
+
 def test_eq_12_has_the_stated_mean_and_variance_once_a_second() -> None:
     scenario = replace(
         named_scenario("paper-1"), {"duration_min": 60, "follower_duration_min": 0.5, "beams": 2}

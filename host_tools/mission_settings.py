@@ -27,14 +27,20 @@ class MissionSettings(Settings):
 def changed(settings: MissionSettings, changes: Mapping[str, object]) -> MissionSettings:
     """Return the settings with changes by dotted or short key.
 
-    The leader is told how uncertain the scenario makes the starts.
+    The leader is told how uncertain the scenario makes the starts, slots how many followers it has.
 
     Raises ConfigError for a key that is unknown or ambiguous, or a value out of bounds.
     """
     settings = replace(settings, changes, prefer="scenario")
     told_m = max(settings.leader.graph.start_sigma_m, settings.scenario.start_error_m)
+    followers = max(settings.scenario.followers, 1)
+    if "slots.followers" in changes and settings.slots.followers != followers:
+        raise ConfigError(
+            f"slots have {settings.slots.followers} followers, the scenario has {followers}; "
+            f"give followers={settings.slots.followers}"
+        )
     derived = {
-        "slots.followers": max(settings.scenario.followers, 1),
+        "slots.followers": followers,
         "leader.graph.start_sigma_m": told_m,
     }
     return replace(settings, derived)

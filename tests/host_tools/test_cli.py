@@ -90,6 +90,11 @@ def test_sound_profile_is_shown_as_it_is_set(
         (["--set", "leg_m"], "is not KEY=VALUE"),
         (["--set", "leg_m=long"], "give a value of type float"),
         (["--loss", "1.5"], "must be at most 1"),
+        (
+            ["--set", "slots.followers=3"],
+            "slots have 3 followers, the scenario has 1; give followers=3",
+        ),
+        (["--set", "followers=2", "--set", "slots.followers=1"], "give followers=1"),
         (["--set", "line_spacing_m=inf"], "line_spacing_m is inf; give a finite number in m"),
         (["--set", "corner_offset_m=-inf"], "corner_offset_m is -inf; give a finite number"),
         (["--set", "line_spacing_m=nan"], "line_spacing_m is nan; give a finite number in m"),

@@ -19,7 +19,7 @@ from host_tools.nodes import Node, Steps
 from host_tools.octree import decode_octree, octree_submap
 from protocol.acoustics import Delivery
 from protocol.codec import decode
-from protocol.errors import ConfigError, EstimationError, RemoteProtocolError
+from protocol.errors import ConfigError, EstimationError
 from protocol.packets import SubmapFragment, SubmapPacket
 from protocol.reassembly import Key, SubmapTransfer
 from protocol.vehicles import LEADER
@@ -91,11 +91,11 @@ def unlimited(originals: Originals, cell_m: float) -> Rebuild:
 
 
 class Unheard:
-    """Hands to the leader, with the last frame of a sub-map, what was lost where most of it was.
+    """Hands to the leader, with the last frame of a sub-map, what it missed where that was most.
 
     Otherwise the leader would not know that there is such a sub-map, or where it lies. No ranges
-    come with frames that nobody heard. It is told of every delivery in turn, and holds the lost
-    frames of one sub-map of each follower.
+    come with frames that nobody heard. It is told of every delivery in turn, and holds the
+    missed frames of one sub-map of each follower.
     """
 
     def __init__(self, leader: Node) -> None:
@@ -104,10 +104,9 @@ class Unheard:
 
     def note(self, delivery: Delivery) -> None:
         """Take what became of a frame at a receiver."""
-        try:
-            packet = decode(delivery.frame)
-        except RemoteProtocolError:  # damaged on its way: what it was nobody knows
+        if delivery.sent is None:
             return
+        packet = decode(delivery.sent)
         if delivery.destination != LEADER or not isinstance(packet, SubmapPacket | SubmapFragment):
             return
         header = packet.header
@@ -117,7 +116,7 @@ class Unheard:
             lost = []
             self._newest[delivery.source] = key, lost
         if delivery.fate not in HEARD:
-            lost.append(delivery.frame)
+            lost.append(delivery.sent)
         is_last = header.fragment == header.fragment_count - 1
         if is_last and 2 * len(lost) > header.fragment_count:
             for frame in lost:

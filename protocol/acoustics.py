@@ -93,7 +93,8 @@ class Delivery:
 
     t_rx_s is the measured arrival of the first bit, noise and outlier included, None when nothing
     was received; the frame is complete, and handed over, at `t_delivered_s`. fate is delivered,
-    corrupt, duplicate, lost, collision, half-duplex or out-of-reach.
+    corrupt, duplicate, lost, collision, half-duplex or out-of-reach. sent is the frame as it was
+    transmitted, None where no node did that.
     """
 
     source: int
@@ -103,6 +104,7 @@ class Delivery:
     t_delivered_s: float
     frame: bytes
     fate: str
+    sent: bytes | None = None
 
     @property
     def was_received(self) -> bool:
@@ -123,6 +125,7 @@ class _Arrival:
     fate: str
     frame: bytes
     echo: bool
+    sent: bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,6 +244,7 @@ class Water:
             fate,
             damaged if fate == "corrupt" else frame,
             has_echo and fate in {"delivered", "corrupt"},
+            frame,
         )
         self._push(max(arrival.begins_s, measured_s) + duration_s, arrival)
 
@@ -273,6 +277,7 @@ class Water:
             t_delivered_s=decided_s,
             frame=arrival.frame,
             fate=fate,
+            sent=arrival.sent,
         )
 
     def _is_lost(self, link: tuple[int, int]) -> bool:

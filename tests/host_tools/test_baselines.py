@@ -85,17 +85,22 @@ def test_octrees_travel_whole_whatever_the_default_profile_needs() -> None:
     assert status.get("submaps_not_rebuilt", 0) == 0
 
 
-@pytest.mark.parametrize("profile", ["lattice", "paper"])
-def test_unlimited_loses_no_submap_whatever_the_water_does(profile: str) -> None:
+@pytest.mark.parametrize(
+    ("profile", "water"),
+    [
+        ("lattice", ["--loss", "0.9"]),
+        ("paper", ["--loss", "0.9"]),
+        ("lattice", ["--loss", "0.1", "--set", "corruption=0.9"]),
+    ],
+)
+def test_unlimited_loses_no_submap_whatever_the_water_does(profile: str, water: list[str]) -> None:
     parser = argparse.ArgumentParser()
     add_mission_arguments(parser)
     short = ["--set", "duration_min=4", "--set", "follower_duration_min=4", "--set", "beams=48"]
-    arguments = parser.parse_args(
-        ["--baseline", "unlimited", "--profile", profile, "--loss", "0.9", *short]
-    )
+    arguments = parser.parse_args(["--baseline", "unlimited", "--profile", profile, *water, *short])
     result = simulate(settings_of(arguments), None, arguments.seed, arguments.baseline)
     status = result.counters["leader"]
     assert status["reassembly_complete"] == 4  # the fifth is yet to be sent
     assert status.get("submaps_off_track", 0) == 0
     assert {patch.vehicle for patch in result.patches} == {0, 1}
-    assert sum(d.fate == "lost" for d in result.deliveries) > 40
+    assert sum(d.fate in {"lost", "corrupt"} for d in result.deliveries) > 40

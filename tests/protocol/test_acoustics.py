@@ -158,7 +158,7 @@ def test_corrupted_frames_arrive_with_turned_bits() -> None:
     deliveries = run(water(settings, at(0.0, 500.0)), 1000)
     corrupt = [d for d in deliveries if d.fate == "corrupt"]
     assert len(corrupt) / 1000 == pytest.approx(0.3, abs=0.05)
-    assert all(d.frame != FRAME and len(d.frame) == 256 for d in corrupt)
+    assert all(d.frame != FRAME and len(d.frame) == 256 and d.sent == FRAME for d in corrupt)
     assert all(d.frame == FRAME for d in deliveries if d.fate == "delivered")
 
 

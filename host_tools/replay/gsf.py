@@ -71,8 +71,8 @@ def read_gsf(path: Path) -> ReplayedLine:
     crs = utm_of(longitude[0], latitude[0])
     east, north = transform(GEOGRAPHIC, crs, longitude, latitude)[:2]
     track_m = np.stack([north, east], axis=1)
-    began_s = _seconds(pings[0])
-    times_s = np.array([_seconds(ping) - began_s for ping in pings])
+    began_s = ping_s(pings[0])
+    times_s = np.array([ping_s(ping) - began_s for ping in pings])
     yaw_rad = np.radians([float(ping["Heading_deg"]) for ping in pings])
     parts, sizes = [], []
     for ping, position_m, heading_rad in zip(pings, track_m - track_m[0], yaw_rad, strict=True):
@@ -147,8 +147,10 @@ def _soundings(ping: dict[str, Any], position_m: Array, yaw_rad: float) -> tuple
     return np.stack([north_m, east_m, depth_m], axis=1)[good], depth_m.size
 
 
-def _seconds(ping: dict[str, Any]) -> float:
-    return datetime.datetime.fromisoformat(str(ping["PingTime"])).timestamp()
+def ping_s(ping: dict[str, Any]) -> float:
+    """Return when a ping was sent, in seconds since 1970; a log tells UTC."""
+    moment = datetime.datetime.fromisoformat(str(ping["PingTime"]))
+    return (moment if moment.tzinfo else moment.replace(tzinfo=datetime.UTC)).timestamp()
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:

@@ -1,11 +1,12 @@
 import os
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from host_tools.cli import main
-from host_tools.replay.gsf import read_gsf, utm_of
+from host_tools.replay.gsf import ping_s, read_gsf, utm_of
 
 
 def logs() -> Path:
@@ -20,6 +21,17 @@ def test_utm_zone_follows_longitude_and_hemisphere() -> None:
     assert utm_of(-64.6, 17.8) == "EPSG:32620"
     assert utm_of(3.2, -42.0) == "EPSG:32731"
     assert utm_of(180.0, 1.0) == "EPSG:32660"
+
+
+def test_times_of_pings_are_utc(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TZ", "Europe/Berlin")  # where 02:59:59 came twice that night
+    time.tzset()
+    try:
+        seconds = [ping_s({"PingTime": f"2023-10-29 {at}"}) for at in ("02:59:59", "03:00:00.5")]
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+    assert seconds[1] - seconds[0] == 1.5
 
 
 def test_gsf_line_lies_where_and_as_deep_as_it_was_surveyed() -> None:

@@ -18,6 +18,7 @@ Steps = Iterator[tuple[Odometry, Ping | None]]
 
 Row = tuple[float, ...]
 ROW_NUMBERS = 10
+YAW = 9
 
 
 def belief_row(belief: Belief, reckoned: ReckonedState) -> Row:
@@ -39,7 +40,7 @@ def belief_columns(rows: np.ndarray) -> dict[str, np.ndarray]:
         "live_m": rows[:, 1:3],
         "live_covariance_m2": rows[:, 3:7].reshape(-1, 2, 2),
         "reckoned_m": rows[:, 7:9],
-        "yaw_rad": rows[:, 9],
+        "yaw_rad": rows[:, YAW],
     }
 
 

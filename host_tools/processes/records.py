@@ -17,11 +17,11 @@ import numpy as np
 
 from firmware.belief import Belief
 from firmware.dead_reckoning import ReckonedState
-from firmware.geometry import Array
+from firmware.geometry import Array, wrap_angle
 from firmware.leader.trajectory import Trajectory
 from host_tools.collect import LeaderRecord
 from host_tools.mapping import DepthMap
-from host_tools.nodes import ROW_NUMBERS, belief_columns, belief_row
+from host_tools.nodes import ROW_NUMBERS, YAW, belief_columns, belief_row
 from host_tools.results import ClosureResult, Counters, SoundingPatch
 from protocol.errors import ConfigError
 from protocol.seal_state import write_durably
@@ -79,7 +79,9 @@ class VehicleFiles:
         if len(by_time) < 2:
             raise ConfigError(f"{self._path('beliefs')} holds no mission; start {self.name} anew")
         known = np.array([by_time[t] for t in sorted(by_time)])
+        known[:, YAW] = np.unwrap(known[:, YAW])
         columns = [np.interp(time_s, known[:, 0], known[:, k]) for k in range(ROW_NUMBERS)]
+        columns[YAW] = wrap_angle(columns[YAW])
         return belief_columns(np.stack(columns, axis=1))
 
     def write_counters(self, counters: Counters) -> None:

@@ -155,6 +155,16 @@ def test_what_lies_on_the_shelf_of_a_store_is_in_the_record(
     assert any((patch.depth_m == 30.0).all() for patch in patches)
 
 
+def test_yaw_in_a_gap_turns_the_short_way(tmp_path: Path) -> None:
+    files = VehicleFiles(tmp_path, 0)
+    files.prepare()
+    for time_s, yaw_rad in ((0.0, 3.1), (2.0, -3.0), (4.0, -2.9)):
+        state = ReckonedState(time_s=time_s, north_m=1.0, east_m=2.0, yaw_rad=yaw_rad, depth_m=5.0)
+        files.note(Belief(time_s=time_s, position_m=np.ones(2), covariance_m2=np.eye(2)), state)
+    found_rad = files.beliefs(np.arange(5.0))["yaw_rad"]
+    np.testing.assert_allclose(found_rad, [3.1, 0.05 - np.pi, -3.0, -2.95, -2.9], atol=1e-4)
+
+
 def test_starts_are_counted_and_by_the_clock_where_the_count_is_damaged(tmp_path: Path) -> None:
     files = VehicleFiles(tmp_path, 0)
     assert [files.prepare(), files.prepare()] == [0, 1]

@@ -9,6 +9,7 @@ where a vehicle truly is.
 import dataclasses
 import json
 import socket
+import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -100,9 +101,21 @@ def from_line(line: bytes) -> Message:
             body["arrivals"] = tuple(Arrival(**arrival) for arrival in body["arrivals"])
         if kind is Done:
             body["frames"], body["missed"] = tuple(body["frames"]), tuple(body["missed"])
-        return kind(**body)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        message = kind(**body)
+        parts = [message, *(message.arrivals if isinstance(message, Advance) else ())]
+        if not all(_fits(getattr(p, f.name), f.type) for p in parts for f in dataclasses.fields(p)):
+            raise TypeError("a value of another type than its field")
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise RemoteProtocolError(f"control line: {line[:60]!r} is no message") from error
+    return message
+
+
+def _fits(value: object, kind: Any) -> bool:  # noqa: ANN401
+    """Return whether a value is of a field's type; a whole number is a float as well."""
+    if isinstance(value, tuple):
+        return all(_fits(part, typing.get_args(kind)[0]) for part in value)
+    kinds = typing.get_args(kind) or (kind,)
+    return type(value) in kinds or (type(value) is int and float in kinds)
 
 
 class ControlLine:

@@ -44,7 +44,25 @@ def test_messages_come_back_the_same_to_the_last_bit_of_a_float(message: Message
     assert from_line(line) == message
 
 
-@given(line=st.binary() | st.sampled_from([b'{"is":"done"}', b'{"is":"advance","now_s":1}', b"3"]))
+WRONG = [
+    b'{"is":"done"}',
+    b'{"is":"advance","now_s":1}',
+    b"3",
+    b'{"is":"hello","vehicle":[1],"mission":"m"}',
+    b'{"is":"hello","vehicle":true,"mission":"m"}',
+    b'{"is":"hello","vehicle":1,"mission":{}}',
+    b'{"is":"done","now_s":"1","frames":[],"missed":[],"line_bytes":0}',
+    b'{"is":"done","now_s":1,"frames":[[1]],"missed":[],"line_bytes":0}',
+    b'{"is":"done","now_s":1,"frames":[],"missed":["a"],"line_bytes":0}',
+    b'{"is":"done","now_s":1,"frames":[],"missed":[],"line_bytes":null}',
+    b'{"is":"advance","now_s":1,"arrivals":[{"crc":1,"toa_s":"x","heard_s":1}],"in_real_time":true}',
+    b'{"is":"refused","reason":3}',
+    b'{"is":["hello"]}',
+    b'{"a":' + b"[" * 50_000,
+]
+
+
+@given(line=st.binary() | st.sampled_from(WRONG))
 def test_any_other_bytes_are_refused_as_the_peers_error(line: bytes) -> None:
     with pytest.raises(RemoteProtocolError):
         from_line(line)

@@ -1,6 +1,7 @@
 """The channel's end and a vehicle's end over real ptys, the vehicle in a thread."""
 
 import shutil
+import socket
 import subprocess
 import threading
 import time
@@ -225,6 +226,17 @@ def test_a_process_that_does_not_belong_is_told_why(
     group.close()
     threads[0].join()
     assert "has gone; start all again" in str(leader.error)
+
+
+def test_a_hello_that_is_none_costs_only_its_sender_the_line(group: ProcessGroup) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as stranger:
+        stranger.connect(group.clock_url.removeprefix("unix://"))
+        stranger.sendall(b'{"is":"hello","vehicle":[1],"mission":"m"}\n')
+        for _ in range(3):
+            group.look()
+        stranger.settimeout(5.0)
+        assert stranger.recv(100) == b""
+    assert len(group.missing()) == 2
 
 
 def test_a_clock_that_is_not_there_is_one_line(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 import matplotlib as mpl
 
 from benchmarks.days import HEAD, Row, lasting, mission
-from host_tools.commands import add_mission_arguments, settings_of, status_of
+from host_tools.commands import add_seed_argument, add_survey_arguments, settings_of, status_of
 from host_tools.mission_settings import changed
 
 mpl.use("Agg")
@@ -72,7 +72,8 @@ def draw(by_hour: list[Row], by_followers: list[Row], path: Path) -> None:
 def main() -> None:
     """Run the missions; print an hour a line as they go, then the table, and draw it."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.cost", description=__doc__)
-    add_mission_arguments(parser)
+    add_survey_arguments(parser)
+    add_seed_argument(parser)
     parser.set_defaults(scenario="day-1")
     parser.add_argument("--hours", type=float, default=3.0)
     parser.add_argument("--follower-hours", type=float, default=1.0)

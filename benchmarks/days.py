@@ -22,7 +22,7 @@ import matplotlib as mpl
 import numpy as np
 
 from benchmarks.days_vehicle import Aboard, Gauge, Heard, NoLog, Order
-from host_tools.commands import add_mission_arguments, settings_of, status_of
+from host_tools.commands import add_seed_argument, add_survey_arguments, settings_of, status_of
 from host_tools.mission import deployed, run, simulated_vehicles, water_between
 from host_tools.mission_settings import MissionSettings, changed
 from host_tools.nodes import BeliefLog
@@ -206,9 +206,10 @@ def draw(rows: list[Row], path: Path) -> None:
 
 
 def main() -> None:
-    """Run the mission; print a line an hour, and what the issue asks of them."""
+    """Run the mission; print a line an hour, how steps grew, and how far a batch lies."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.days", description=__doc__)
-    add_mission_arguments(parser)
+    add_survey_arguments(parser)
+    add_seed_argument(parser)
     parser.set_defaults(scenario="day-1")
     parser.add_argument("--hours", type=float, default=3.0)
     parser.add_argument("--plot", type=Path, help="a .png or .svg")

@@ -20,7 +20,13 @@ from firmware.follower.journaled import JournaledFollower
 from firmware.geometry import Array
 from firmware.journal import JournalSettings, Owner
 from firmware.leader.journaled import JournaledLeader
-from host_tools.commands import add_mission_arguments, count, settings_of, status_of
+from host_tools.commands import (
+    add_seed_argument,
+    add_survey_arguments,
+    count,
+    settings_of,
+    status_of,
+)
 from host_tools.kills import Fate, MortalJournal, MortalNode, SensorTape
 from host_tools.mission import deployed, run, simulated_vehicles, water_between
 from host_tools.mission_settings import MissionSettings
@@ -132,7 +138,8 @@ def main() -> None:
     """Run both missions and compare."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=count, default=50)
-    add_mission_arguments(parser)
+    add_survey_arguments(parser)
+    add_seed_argument(parser)
     arguments = parser.parse_args()
     settings = settings_of(arguments)
     terrain = open_terrain(arguments.terrain, settings.scenario.relief_seed)

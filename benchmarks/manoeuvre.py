@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 from firmware.geometry import Array
 from firmware.leader.core import LeaderCore
 from firmware.leader.manoeuvre import Proposal
-from host_tools.commands import add_mission_arguments, count, settings_of, status_of
+from host_tools.commands import add_survey_arguments, count, settings_of, status_of
 from host_tools.mission import local_nodes, run, simulated_vehicles, water_between
 from host_tools.mission_settings import MissionSettings, changed
 from host_tools.simulator.placement import place_survey
@@ -83,8 +83,10 @@ def _error_m(leader: LeaderCore, vehicle: SimulatedVehicle) -> float:
 
 def main() -> None:
     """Run each seed twice and print the errors side by side."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.manoeuvre", description=__doc__)
-    add_mission_arguments(parser)
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.manoeuvre", description=__doc__, allow_abbrev=False
+    )
+    add_survey_arguments(parser)
     parser.add_argument("--seeds", type=count, default=3)
     parser.add_argument("--survey-min", type=float, default=12.0)
     arguments = parser.parse_args()

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from host_tools.commands import add_mission_arguments, count, status_of
+from host_tools.commands import add_survey_arguments, count, status_of
 from host_tools.processes.demo import run_demo
 from host_tools.processes.emulated_modems import MODEMS
 from host_tools.processes.voyage import Voyage, voyage_of
@@ -47,8 +47,10 @@ def table(found: dict[str, np.ndarray]) -> list[str]:
 
 def main() -> None:
     """Run the missions and print the table."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.modems", description=__doc__)
-    add_mission_arguments(parser)
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.modems", description=__doc__, allow_abbrev=False
+    )
+    add_survey_arguments(parser)
     parser.add_argument("--seeds", type=count, default=3, help="seeds 1 to N")
     arguments = parser.parse_args()
     found: dict[str, list[np.ndarray]] = {link: [] for link in LINKS}

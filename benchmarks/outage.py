@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from host_tools.commands import add_mission_arguments, count, settings_of, status_of
+from host_tools.commands import add_survey_arguments, count, settings_of, status_of
 from host_tools.mission_settings import MissionSettings, changed
 from host_tools.simulate import simulate
 
@@ -45,8 +45,10 @@ def live_errors(settings: MissionSettings, terrain: Path | None, seed: int) -> S
 
 def main() -> None:
     """Run the missions; print the spans of each, and the ratio after the link's return."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.outage", description=__doc__)
-    add_mission_arguments(parser)
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.outage", description=__doc__, allow_abbrev=False
+    )
+    add_survey_arguments(parser)
     parser.set_defaults(scenario="day-1")
     parser.add_argument("--seeds", type=count, default=3, help="seeds 1 to N")
     arguments = parser.parse_args()

@@ -70,7 +70,14 @@ def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_mission_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what says which mission is simulated: terrain, scenario, seed, profile, settings."""
+    """Add what says which mission is simulated: what is surveyed, seed, baseline."""
+    add_survey_arguments(parser)
+    add_seed_argument(parser)
+    add_baseline_argument(parser)
+
+
+def add_survey_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what says what is surveyed and how: terrain, scenario, settings, profile."""
     parser.add_argument(
         "--terrain",
         type=Path,
@@ -78,15 +85,18 @@ def add_mission_arguments(parser: argparse.ArgumentParser) -> None:
         help="GeoTIFF, BAG or other raster in a metric projection; default: a built-in relief",
     )
     add_settings_arguments(parser)
-    parser.add_argument("--seed", type=seed, default=1, metavar="N", help="default: 1")
-    add_profile_argument(parser)
-    parser.add_argument("--baseline", choices=BASELINES, default="none", help="default: none")
-
-
-def add_profile_argument(parser: argparse.ArgumentParser) -> None:
-    """Add --profile."""
     profile = FollowerSettings().profile
     parser.add_argument("--profile", choices=CHOICES, default=profile, help=f"default: {profile}")
+
+
+def add_seed_argument(parser: argparse.ArgumentParser) -> None:
+    """Add --seed."""
+    parser.add_argument("--seed", type=seed, default=1, metavar="N", help="default: 1")
+
+
+def add_baseline_argument(parser: argparse.ArgumentParser) -> None:
+    """Add --baseline."""
+    parser.add_argument("--baseline", choices=BASELINES, default="none", help="default: none")
 
 
 def settings_of(arguments: argparse.Namespace) -> MissionSettings:

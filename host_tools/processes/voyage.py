@@ -4,14 +4,8 @@ import argparse
 import hashlib
 import json
 from dataclasses import dataclass
-from pathlib import Path
 
-from host_tools.commands import (
-    add_profile_argument,
-    add_settings_arguments,
-    seed,
-    settings_of,
-)
+from host_tools.commands import add_seed_argument, add_survey_arguments, settings_of
 from host_tools.mission_settings import MissionSettings
 from host_tools.simulator.placement import Site, place_survey
 from host_tools.simulator.terrain import open_terrain
@@ -64,10 +58,8 @@ def voyage_of(arguments: argparse.Namespace) -> Voyage:
 
 def add_voyage_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that a mission of processes is meant by."""
-    parser.add_argument("--terrain", type=Path, metavar="FILE", help="default: a built-in relief")
-    add_settings_arguments(parser)
-    parser.add_argument("--seed", type=seed, default=1, metavar="N", help="default: 1")
-    add_profile_argument(parser)
+    add_survey_arguments(parser)
+    add_seed_argument(parser)
 
 
 def _as_given(arguments: argparse.Namespace) -> tuple[str, ...]:

@@ -2,7 +2,8 @@
 
     python -m benchmarks.accuracy --terrain FILE --scenario paper-1 --seeds 5 --set KEY=VALUE
 
-takes what `fathomlink simulate` takes. Speed is that of the mission alone, one core, no report.
+takes what `fathomlink simulate` takes, and instead of a seed the first and how many. Speed is that
+of the mission alone, one core, no report.
 """
 
 import argparse
@@ -14,11 +15,19 @@ from dataclasses import dataclass
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from host_tools.commands import add_mission_arguments, count, settings_of, status_of
+from host_tools.commands import (
+    add_baseline_argument,
+    add_survey_arguments,
+    count,
+    seed,
+    settings_of,
+    status_of,
+)
 from host_tools.evaluation import Evaluation, JudgedClosure, evaluate
 from host_tools.simulate import simulate
 
 Figures = dict[str, float]
+ACTIVE, FALSE = "closures active", "false among active"
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +62,8 @@ def figures(evaluation: Evaluation, real_time: float) -> Figures:
         "tile shift, 95 %": tiles.p95_m,
         "closures detected": float(len(evaluation.closures)),
         "valid among detected": _valid(list(evaluation.closures)),
-        "closures active": float(len(active)),
+        ACTIVE: float(len(active)),
+        FALSE: float(sum(not c.is_valid for c in active)),
         "valid among active": _valid(active),
         "speed": real_time,
     }
@@ -68,6 +78,7 @@ _UNITS: tuple[tuple[str, str, bool], ...] = (
     ("NEES", "", True),
     ("under", "%", False),
     ("valid", "%", False),
+    ("false", "", True),
     ("closures", "", False),
     ("speed", "x real time", False),
     ("", "m", True),
@@ -92,22 +103,32 @@ def table(runs: list[Figures]) -> list[str]:
     return lines
 
 
+def total(runs: list[Figures]) -> str:
+    """Return a line about the active closures of all runs."""
+    false, active = (sum(run[name] for run in runs) for name in (FALSE, ACTIVE))
+    return f"{false:,.0f} false of {active:,.0f} active closures over all {len(runs)} seeds"
+
+
 def main() -> None:
     """Run the missions and print the table."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.accuracy", description=__doc__)
-    add_mission_arguments(parser)
-    parser.add_argument("--seeds", type=count, default=5, help="seeds 1 to N")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.accuracy", description=__doc__, allow_abbrev=False
+    )
+    add_survey_arguments(parser)
+    add_baseline_argument(parser)
+    parser.add_argument("--seeds", type=count, default=5, metavar="N", help="default: 5")
+    parser.add_argument("--first", type=seed, default=1, metavar="N", help="first seed (default 1)")
     arguments = parser.parse_args()
     settings, runs = settings_of(arguments), []
-    for seed in range(1, arguments.seeds + 1):
+    for number in range(arguments.first, arguments.first + arguments.seeds):
         began_s = time.process_time()
         with threadpool_limits(1):
-            result = simulate(settings, arguments.terrain, seed, arguments.baseline)
+            result = simulate(settings, arguments.terrain, number, arguments.baseline)
         took_s = time.process_time() - began_s
         runs.append(figures(evaluate(result), settings.scenario.duration_s / took_s))
         live = [v for k, v in runs[-1].items() if "live, share" in k]
-        print(f"seed {seed}: live {' / '.join(f'{share:.1f}' for share in live)} %", flush=True)
-    print("\n".join(table(runs)))
+        print(f"seed {number}: live {' / '.join(f'{share:.1f}' for share in live)} %", flush=True)
+    print("\n".join([*table(runs), total(runs)]))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """What each profile's map is worth, beside its peers: fidelity, loss, cost, honesty, the limit.
 
-    python -m benchmarks.compression --per-site 3 --seed 1 --json compression.json [--gpytorch]
+    python -m benchmarks.compression --per-site 3 --seed 1 --json compression.json [--quick]
 
 RMSE against the true surface on a 1 m grid inside the hull of the soundings, wherever a method has
 a depth, relative to FITC with squared exponential kernel, 150 points and jitter decoding on the
@@ -25,6 +25,7 @@ from threadpoolctl import threadpool_limits
 from benchmarks import compression_gpytorch
 from benchmarks.compression_bound import bounds_m2
 from benchmarks.compression_peers import (
+    FRAMES,
     Coded,
     Decode,
     cosine,
@@ -45,7 +46,7 @@ from firmware.submaps import BinnedSoundings, GriddedSubmap
 from protocol.codec import decode as decode_frame
 from protocol.codec import encode as encode_frame
 from protocol.errors import EstimationError
-from protocol.packets import SubmapFragment, SubmapPacket
+from protocol.packets import SIZE_BYTES, Profile, SubmapFragment, SubmapPacket
 
 LOSSES = (0.0, 0.1, 0.14, 0.2)
 DRAWS = 8
@@ -168,6 +169,15 @@ def methods(gpytorch: bool) -> dict[str, Callable[[Window], Coded]]:
     return out
 
 
+def frames_of(name: str, size_bytes: int) -> int:
+    """Return in how many frames a coder's bytes travel: those of a peer in ten."""
+    if name not in OURS:
+        return FRAMES
+    is_small = OURS[name][1].small_frames
+    profile = Profile.SUBMAP_LATTICE_SMALL if is_small else Profile.SUBMAP_LATTICE
+    return size_bytes // SIZE_BYTES[profile]
+
+
 def fidelity(chosen: list[Window], gpytorch: bool) -> dict[str, dict[str, dict[str, object]]]:
     """Return RMSE in m, coverage, CPU and distance to the bound for each window and method."""
     table: dict[str, dict[str, dict[str, object]]] = {}
@@ -178,7 +188,7 @@ def fidelity(chosen: list[Window], gpytorch: bool) -> dict[str, dict[str, dict[s
         for name, code in coders.items():
             coded = code(window)
             coded = dataclasses.replace(coded, decode=remembered(coded.decode))
-            frames = max(1, round(coded.size_bytes / 256)) if name in OURS else 10
+            frames = frames_of(name, coded.size_bytes)
             found = [rmse_m(coded, window, loss, frames) for loss in LOSSES]
             coding_m2 = np.interp(np.log2(8.0 * coded.size_bytes), *bound)
             rows[name] = {

@@ -24,7 +24,7 @@ REAL = {
     "medes": ("medes_islands_10m.tif", False),
     "shelf": ("flat_shelf_2m.bag", False),
 }
-"""Files, and whether a patch is taken as it is; the coarser ones are scaled as the issue says."""
+"""Files, and whether a patch is taken only as it is; of coarser ones the relief is scaled, too."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -23,7 +23,7 @@ from protocol.seal_state import FileMarks, ReservedCounter
 
 KEYS = Keys(b"the key of the two of one fleet.")
 RECOVERY_S = 600.0
-"""Within this after the last fault all must be well again (issue 5)."""
+"""Within this after the last fault all must be well again."""
 
 _FORGETFUL = (Fault.DISK_FULL, Fault.STORE_READ_ONLY)
 """With no disk for its marks, a receiver that dies may take a replayed frame for a new one."""

@@ -38,6 +38,16 @@ QUALITY_PACKETS = 8.0
 """The quality is averaged over about this many packets: half a minute of a full link."""
 REPEAT_NOTICE_S = 10.0
 """A notice that says the same as the last one within this time is left out: no storm."""
+ALIVE_QUERY_S = 10.0
+"""Silence after which a core asks its modem whether it is there, and still has our address."""
+FAILURES_TO_DEATH = 5
+"""Packets in a row without an answer before a core takes its modem for gone."""
+LONGEST_PAUSE_S = 16.0
+"""Cap of a core's pause after refusals, which doubles with each."""
+REQUESTS_CAP = 16
+"""Cap of ranges and the like that are asked of a core and not yet of its modem."""
+EVENTS_CAP = 512
+"""Cap of a core's events that nobody fetches: a minute of rate 5 is about 200; older ones go."""
 
 S = TypeVar("S", bound=Settings)
 

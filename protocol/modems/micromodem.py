@@ -7,11 +7,11 @@ from open drivers and the public guide; WHOI has not confirmed them.
 
 from protocol.errors import LocalProtocolError
 from protocol.modems.base import Modem, ModemContext, ModemUrl
-from protocol.modems.dialect_driver import open_dialect, settings_from_url
+from protocol.modems.dialect_driver import ALIVE_QUERY_S, open_dialect, settings_from_url
 from protocol.modems.micromodem_machine import NOTHING
 from protocol.modems.micromodem_settings import MicroModemSettings
 from protocol.modems.micromodem_states import State
-from protocol.modems.micromodem_traffic import ALIVE_QUERY_S, Traffic
+from protocol.modems.micromodem_traffic import Traffic
 
 
 class MicroModem(Traffic):

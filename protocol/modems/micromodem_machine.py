@@ -4,6 +4,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 
+from protocol.modems.dialect_driver import EVENTS_CAP
 from protocol.modems.events import DialectEvent, ModemComplaint
 from protocol.modems.micromodem_clock import ModemClock
 from protocol.modems.micromodem_reception import PacketInProgress
@@ -12,9 +13,6 @@ from protocol.modems.micromodem_states import TABLE, WAITS, State
 from protocol.modems.nmea import Sentence, SentenceReader
 from protocol.modems.outbox import Outbox
 from protocol.modems.stamping import Stamp, stamp_frame
-
-EVENTS_CAP = 512
-"""Events that nobody fetches: a minute of rate 5 is about 200; older ones go."""
 
 NOTHING = Sentence(name="", fields=())
 

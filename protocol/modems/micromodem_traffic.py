@@ -9,6 +9,12 @@ import math
 from collections import deque
 
 from protocol.errors import LocalProtocolError
+from protocol.modems.dialect_driver import (
+    ALIVE_QUERY_S,
+    FAILURES_TO_DEATH,
+    LONGEST_PAUSE_S,
+    REQUESTS_CAP,
+)
 from protocol.modems.events import (
     FrameAcknowledged,
     FrameSent,
@@ -30,11 +36,6 @@ from protocol.modems.micromodem_states import State
 from protocol.modems.nmea import Sentence, encode
 from protocol.modems.stamping import Stamp, stamp_frame
 
-ALIVE_QUERY_S = 10.0
-"""Silence after which the modem is asked whether it is there, and still has our address."""
-FAILURES_TO_DEATH = 5
-LONGEST_PAUSE_S = 16.0
-REQUESTS_CAP = 16
 TURNAROUND_S = 0.3
 """The modem's own time to answer a cycle, and a margin before the pulse."""
 LATE_S = 0.05

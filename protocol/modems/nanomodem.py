@@ -11,7 +11,15 @@ from collections import deque
 
 from protocol.errors import LocalProtocolError
 from protocol.modems.base import Modem, ModemContext, ModemUrl
-from protocol.modems.dialect_driver import open_dialect, settings_from_url
+from protocol.modems.dialect_driver import (
+    ALIVE_QUERY_S,
+    EVENTS_CAP,
+    FAILURES_TO_DEATH,
+    LONGEST_PAUSE_S,
+    REQUESTS_CAP,
+    open_dialect,
+    settings_from_url,
+)
 from protocol.modems.events import (
     DialectEvent,
     FrameAcknowledged,
@@ -41,13 +49,8 @@ FRAME_BYTES = LONGEST_PAYLOAD - ENVELOPE_BYTES
 PROBE = b"$?"
 """What a Nanomodem answers by its address and supply voltage."""
 
-ALIVE_QUERY_S = 10.0
-FAILURES_TO_DEATH = 5
-LONGEST_PAUSE_S = 16.0
 AIR_MARGIN_S = 0.1
 """After the air time a Nanomodem is given this long to listen to its line again."""
-EVENTS_CAP = 512
-REQUESTS_CAP = 16
 
 
 class Nanomodem:

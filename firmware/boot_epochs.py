@@ -1,8 +1,8 @@
 """Which of its lives a vehicle is in, counted on a disk or, where there is none, by the clock."""
 
-import os
 from pathlib import Path
 
+from protocol.seal_state import write_durably
 from protocol.vehicles import BOOT_EPOCHS
 
 LIFE_S = 40.0
@@ -24,7 +24,7 @@ class EpochFile:
 
     def write(self, epoch: int) -> None:
         """Count a life."""
-        _write_whole(self._path, f"{epoch}\n")
+        write_durably(self._path, f"{epoch}\n")
 
 
 def uncounted_epoch(following: int, began_s: float) -> int:
@@ -34,18 +34,3 @@ def uncounted_epoch(following: int, began_s: float) -> int:
     LIFE_S and at most eight minutes earlier.
     """
     return (following + 1 + int(began_s // LIFE_S) % (BOOT_EPOCHS - 2)) % BOOT_EPOCHS
-
-
-def _write_whole(path: Path, text: str) -> None:
-    """Write a small file so that after any crash it holds the old text or the new."""
-    fresh = path.with_name(path.name + ".new")
-    with fresh.open("w", encoding="ascii") as stream:
-        stream.write(text)
-        stream.flush()
-        os.fsync(stream.fileno())
-    fresh.replace(path)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)

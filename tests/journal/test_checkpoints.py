@@ -57,7 +57,7 @@ class Call:
         ("builtins", "eval"),
         ("firmware.boot_epochs", "os.system"),
         ("firmware.store_file", "sqlite3.connect"),
-        ("firmware.boot_epochs", "_write_whole"),
+        ("firmware.boot_epochs", "write_durably"),
         ("numpy.testing", "runstring"),
         ("protocol.nowhere", "Thing"),
     ],

@@ -118,7 +118,7 @@ def _run(arguments: argparse.Namespace) -> None:
             arguments.terrain,
             arguments.seed,
             arguments.baseline,
-            lambda now_s: _advance(bar, now_s),
+            lambda now_s: advance(bar, now_s),
             arguments.store,
         )
     evaluation = evaluate(result)
@@ -130,7 +130,8 @@ def _run(arguments: argparse.Namespace) -> None:
     print(f"{settings.scenario.duration_s / took_s:.0f} x real time; outputs in {folder}")
 
 
-def _advance(bar: "tqdm[Never]", now_s: float) -> None:
+def advance(bar: "tqdm[Never]", now_s: float) -> None:
+    """Move a bar of seconds."""
     if now_s - bar.n >= 1.0:
         bar.update(int(now_s) - bar.n)
 

@@ -6,7 +6,6 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Never
 
 from tqdm import tqdm
 
@@ -23,7 +22,7 @@ from host_tools.processes.remote_node import RemoteNode
 from host_tools.processes.voyage import Voyage, add_voyage_arguments, voyage_of
 from host_tools.report import write_report
 from host_tools.results import MissionResult
-from host_tools.simulate import outcome_lines
+from host_tools.simulate import advance, outcome_lines
 from host_tools.simulator.vehicle import SimulatedVehicle
 from host_tools.writers import prepare_folder, write_air, write_outputs
 from protocol.acoustics import Delivery
@@ -122,12 +121,6 @@ def vehicle_command(group: ProcessGroup, node: RemoteNode, voyage: Voyage, out: 
     name = ["leader"] if node.vehicle == 0 else ["follower", "--vehicle", str(node.vehicle)]
     ports = ["--modem", group.modem_url(node.vehicle), "--clock", group.clock_url]
     return [*name, *ports, "--out", str(out), *voyage.arguments]
-
-
-def advance(bar: "tqdm[Never]", now_s: float) -> None:
-    """Move a bar of seconds."""
-    if now_s - bar.n >= 1.0:
-        bar.update(int(now_s) - bar.n)
 
 
 def finish(result: MissionResult, out: Path, *, report: bool = True) -> list[str]:

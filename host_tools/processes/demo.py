@@ -16,7 +16,6 @@ from tqdm import tqdm
 from host_tools.commands import Command
 from host_tools.processes.channel import (
     add_modem_argument,
-    advance,
     finish,
     host_mission,
     vehicle_command,
@@ -26,6 +25,7 @@ from host_tools.processes.process_group import ProcessGroup
 from host_tools.processes.records import FOLDER
 from host_tools.processes.remote_node import RemoteNode
 from host_tools.processes.voyage import Voyage, add_voyage_arguments, voyage_of
+from host_tools.simulate import advance
 from host_tools.writers import prepare_folder
 from protocol.errors import FathomError
 

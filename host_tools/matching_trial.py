@@ -5,6 +5,7 @@ error of dead reckoning, which the match has to find. Positions within a sub-map
 were in the paper, whose sub-maps were positioned by satellite.
 """
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -204,15 +205,7 @@ def _submap(
 
 
 def _moved(bins: BinnedSoundings, by_m: Array) -> BinnedSoundings:
-    return BinnedSoundings(
-        cell_m=bins.cell_m,
-        north_m=bins.north_m + by_m[0],
-        east_m=bins.east_m + by_m[1],
-        depth_m=bins.depth_m,
-        variance_m2=bins.variance_m2,
-        count=bins.count,
-        time_s=bins.time_s,
-    )
+    return dataclasses.replace(bins, north_m=bins.north_m + by_m[0], east_m=bins.east_m + by_m[1])
 
 
 def _rebuilt(

@@ -5,7 +5,7 @@ import itertools
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from tqdm import tqdm
 
@@ -56,14 +56,7 @@ def trials(trial: Trial, seeds: Iterable[int]) -> Iterator[Outcome]:
         outcome = trial(number)
         if number % TWICE_EVERY == 0 and trial(number) != outcome:
             wrong = (*outcome.violations, "the same seed gave other bytes")
-            outcome = Outcome(
-                seed=number,
-                violations=wrong,
-                fired=outcome.fired,
-                digest=outcome.digest,
-                recovered_s=outcome.recovered_s,
-                deaths=outcome.deaths,
-            )
+            outcome = replace(outcome, violations=wrong)
         yield outcome
 
 

@@ -4,6 +4,7 @@ import socket
 import time
 from collections import Counter, deque
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
@@ -61,7 +62,6 @@ class StampedModem:
 
     def __init__(self, line: Modem) -> None:
         self._line = line
-        self._expected: deque[Arrival] = deque()
         self._events: deque[ModemEvent] = deque()
         self._written: deque[int] = deque()
         self._told = 0
@@ -96,8 +96,9 @@ class StampedModem:
         return self._events.popleft() if self._events else None
 
     def status(self) -> ModemStatus:
-        """Return the line's counters."""
-        return self._line.status()
+        """Return the line's counters, and ours."""
+        status = self._line.status()
+        return replace(status, errors={**status.errors, **self.counters})
 
     def close(self) -> None:
         """Give the port back."""

@@ -114,7 +114,6 @@ class Modem(Protocol):
 class ModemContext:
     """What a driver may need beyond its URL."""
 
-    now_s: float = 0.0
     tap: Tap | None = None
     stamp: Stamp = stamp_frame
     medium: "LoopbackMedium | None" = None

@@ -73,7 +73,11 @@ class Machine:
 
     def status(self) -> dict[str, int]:
         """Return every counter of this side of the line."""
-        reading = {"lines": self.reader.sound_count, "damaged_lines": self.reader.damaged_count}
+        reading = {
+            "lines": self.reader.sound_count,
+            "damaged_lines": self.reader.damaged_count,
+            "unread_lines": self.reader.unread_count,
+        }
         parts = (self.counters, self.outbox.counters, self.packet.counters, self.clock.counters)
         return reading | {key: value for part in parts for key, value in part.items()}
 

@@ -149,7 +149,8 @@ def _run(arguments: argparse.Namespace) -> None:
     scenario = voyage.settings.scenario
     print(
         f"{scenario.name} cut to {scenario.duration_min:g} minutes (--set duration_min=...), "
-        f"{1 + scenario.followers} vehicles, each a process, over a 1 kbit/s link that loses "
+        f"{1 + scenario.followers} vehicles, each a process, over a "
+        f"{scenario.water.rate_bps / 1000.0:g} kbit/s link that loses "
         f"{scenario.water.loss:.0%}; time is virtual",
         flush=True,
     )

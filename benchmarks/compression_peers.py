@@ -37,11 +37,10 @@ class Coded:
     decode: Decode
     size_bytes: int
     cpu_s: float
-    bits: int = 0
 
 
 def timed(work: Callable[[], tuple[Decode, int]]) -> Coded:
-    """Return what work makes, with the CPU time of this thread."""
+    """Return what work makes, with the CPU time of this process."""
     start_s = time.process_time()
     decode, size_bytes = work()
     return Coded(decode=decode, size_bytes=size_bytes, cpu_s=time.process_time() - start_s)

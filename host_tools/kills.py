@@ -29,18 +29,19 @@ class KilledError(BaseException):
 class Fate:
     """Counts down the events of one vehicle's life to its next death.
 
-    events_between is the mean number of journal events from one kill to the next.
+    There are at most so many kills; events_between is the mean number of journal events from one to
+    the next.
     """
 
     def __init__(self, rng: np.random.Generator, kills: int, events_between: float) -> None:
-        self._rng, self._left, self._mean = rng, kills, events_between
+        self._rng, self._most, self._mean = rng, kills, events_between
         self.kills = 0
         self._countdown = self._draw()
 
     def strike(self) -> None:
         """Raise KilledError when the time has come."""
         self._countdown -= 1.0
-        if self._countdown <= 0.0 and self.kills < self._left:
+        if self._countdown <= 0.0 and self.kills < self._most:
             self.kills += 1
             self._countdown = self._draw()
             raise KilledError

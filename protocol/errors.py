@@ -33,7 +33,7 @@ class ModemTimeout(ModemError, TimeoutError):  # noqa: N818  the name says what 
     """A modem did not answer in time."""
 
 
-class ModemUnavailable(ModemError):  # noqa: N818  # noqa: N818  the name says what happened
+class ModemUnavailable(ModemError):  # noqa: N818  the name says what happened
     """The port is not there, or has vanished."""
 
 

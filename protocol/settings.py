@@ -1,7 +1,7 @@
 """Frozen settings whose fields carry unit, reason and bounds, built from plain mappings.
 
-Every room declares its own settings beside the code that reads them; `firmware.config` and
-`host_tools.scenario` only gather them into trees. A value out of bounds and an unknown key are
+Every room declares its own settings beside the code that reads them; `host_tools.mission_settings`
+only gathers them into one tree. A value out of bounds and an unknown key are
 `ConfigError`s that name the key, the bound and the unit.
 """
 

@@ -30,7 +30,7 @@ class FitReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CompressedPoints:
-    """Pseudo points of the `paper` or `dense` profile, in the order of their fragments.
+    """Pseudo points of the `paper` profile, in the order of their fragments.
 
     points_ned_m is (M, 3), NaN where a place stays unused; the first M / F rows are fragment 0's.
     hyperparameters is (4,) as on the wire.

@@ -2,6 +2,8 @@
 
 import os
 from collections.abc import Callable
+from functools import partial
+from typing import TypeVar
 
 import serial
 
@@ -14,15 +16,18 @@ READ_BYTES = 4096
 WRITE_CAP_BYTES = 65_536
 """Cap of bytes that the port has not taken; a packet of rate 5 is 4,700."""
 
+T = TypeVar("T")
+
 
 class SerialPort:
     """Reads and writes what the operating system takes at once; a failing port is reopened.
 
-    While it is away reads are empty and writes are refused, which the caller sees in `is_open`.
+    While it is away reads are empty and writes are refused, which the caller sees in `is_open`. rts
+    is what that line is held at: boxes of the Micro-Modem 2 take it for power control.
     """
 
-    def __init__(self, path: str, baud: int, tap: Tap | None = None) -> None:
-        self.path, self.baud, self._tap = path, baud, tap
+    def __init__(self, path: str, baud: int, tap: Tap | None = None, *, rts: bool = False) -> None:
+        self.path, self.baud, self._tap, self._rts = path, baud, tap, rts
         self._unsent = bytearray()
         self._retry_at_s = 0.0
         self.reopened = 0
@@ -48,7 +53,7 @@ class SerialPort:
 
     def read(self, now_s: float) -> bytes:
         """Return what has come, possibly nothing."""
-        data = self._guarded(self._read, now_s) or b""
+        data = self._guarded(_waiting, now_s) or b""
         if data and self._tap is not None:
             self._tap("in", data, now_s)
         return data
@@ -60,7 +65,14 @@ class SerialPort:
         if len(self._unsent) + len(data) <= WRITE_CAP_BYTES:
             self._unsent += data
         if self._unsent:
-            self._guarded(self._write, now_s)
+            del self._unsent[: self.push(bytes(self._unsent), now_s)]
+
+    def push(self, data: bytes, now_s: float) -> int:
+        """Write as much of data as the port takes now; return how many bytes those are."""
+        count = self._guarded(partial(_taken, data), now_s) or 0
+        if count and self._tap is not None:
+            self._tap("out", data[:count], now_s)
+        return count
 
     def close(self) -> None:
         """Give the port back for good."""
@@ -71,33 +83,19 @@ class SerialPort:
     def _open(self) -> serial.Serial:
         port = serial.Serial(timeout=0, exclusive=True, baudrate=self.baud)
         port.port = self.path
-        port.rts = False  # before opening: boxes of the Micro-Modem 2 take RTS for power control
+        port.rts = self._rts  # before opening: some boxes take RTS for power control
         try:
             port.open()
         except (serial.SerialException, OSError) as error:
             raise ModemUnavailable(_advice(self.path, error)) from error
         return port
 
-    def _read(self, port: serial.Serial, now_s: float) -> bytes:  # noqa: ARG002
-        if not port.in_waiting:  # raises where the port has gone; a read would return b""
-            return b""
-        return bytes(port.read(READ_BYTES))
-
-    def _write(self, port: serial.Serial, now_s: float) -> bytes:
-        try:
-            count = os.write(port.fileno(), self._unsent)
-        except BlockingIOError:
-            return b""
-        if self._tap is not None:
-            self._tap("out", bytes(self._unsent[:count]), now_s)
-        del self._unsent[:count]
-        return b""
-
-    def _guarded(self, move: Callable[[serial.Serial, float], bytes], now_s: float) -> bytes | None:
+    def _guarded(self, move: Callable[[serial.Serial], T], now_s: float) -> T | None:
+        """Move bytes; a port that fails is closed and tried again later."""
         if self._serial is None:
             return None
         try:
-            return move(self._serial, now_s)
+            return move(self._serial)
         except (serial.SerialException, OSError, TypeError) as error:
             # pyserial raises TypeError when its descriptor vanished under it
             self.last_error = str(error)
@@ -105,6 +103,19 @@ class SerialPort:
             self._serial, self._retry_at_s = None, now_s + REOPEN_S
             self._unsent.clear()
             return None
+
+
+def _waiting(port: serial.Serial) -> bytes:
+    if not port.in_waiting:  # raises where the port has gone; a read would return b""
+        return b""
+    return bytes(port.read(READ_BYTES))
+
+
+def _taken(data: bytes, port: serial.Serial) -> int:
+    try:
+        return os.write(port.fileno(), data)
+    except BlockingIOError:
+        return 0
 
 
 def _advice(path: str, error: Exception) -> str:

@@ -1,12 +1,8 @@
 """A raw serial line: COBS frames over pyserial, on ports that may vanish and come back."""
 
-import os
 from collections import deque
-from collections.abc import Callable
 
-import serial
-
-from protocol.errors import ConfigError, ModemUnavailable
+from protocol.errors import ConfigError
 from protocol.framing import GUARD_BYTES, LineReader, wrap
 from protocol.modems.base import (
     QUEUED_EVENTS,
@@ -20,12 +16,10 @@ from protocol.modems.base import (
     Reception,
     Tap,
 )
+from protocol.modems.port import SerialPort
 
 DEFAULT_BAUD = 19_200
 SLOWEST_BAUD, FASTEST_BAUD = 300, 4_000_000
-REOPEN_S = 1.0
-"""Between attempts to reopen: fast enough for a plug pulled and put back, no load when it stays."""
-READ_BYTES = 4096
 
 
 class SerialLineModem:
@@ -39,15 +33,13 @@ class SerialLineModem:
     frames_per_packet = 1
 
     def __init__(self, path: str, baud: int, tap: Tap | None = None) -> None:
-        self._path, self._baud, self._tap = path, baud, tap
+        self._port, self._was_open = SerialPort(path, baud, tap, rts=True), True
         self.bytes_read = 0
         self._reader = LineReader()
         self._queue: deque[bytes] = deque()
         self._written = 0
         self._events: deque[ModemEvent] = deque()
-        self._sent = self._received = self._dropped_out = self._dropped_in = self._reopened = 0
-        self._retry_at_s = 0.0
-        self._port: serial.Serial | None = self._open()
+        self._sent = self._received = self._dropped_out = self._dropped_in = 0
 
     @property
     def largest_frame_bytes(self) -> int:
@@ -60,14 +52,15 @@ class SerialLineModem:
             del self._queue[1 if self._written else 0]
             self._dropped_out += 1
         self._queue.append(wrap(frame))
-        self._guarded(self._write, now_s)
+        self._flush(now_s)
 
     def poll(self, now_s: float) -> None:
         """Reopen a lost port, write what the port takes, read what it has."""
-        if self._port is None and now_s >= self._retry_at_s:
-            self._reopen(now_s)
-        self._guarded(self._write, now_s)
-        self._guarded(self._read, now_s)
+        if self._port.try_reopen(now_s):
+            self._was_open = True
+            self._notice(f"{self._port.path} is back", now_s)
+        self._flush(now_s)
+        self._take(now_s)
 
     def next_event(self) -> ModemEvent | None:
         """Return the oldest event not yet fetched, or None."""
@@ -76,85 +69,48 @@ class SerialLineModem:
     def status(self) -> ModemStatus:
         """Return the counters."""
         return ModemStatus(
-            is_up=self._port is not None,
+            is_up=self._port.is_open,
             queued=len(self._queue),
             sent=self._sent,
             received=self._received,
             dropped_out=self._dropped_out,
             dropped_in=self._dropped_in + self._reader.overflowed,
             discarded=self._reader.bad_frames + self._reader.overlong,
-            reopened=self._reopened,
+            reopened=self._port.reopened,
         )
 
     def close(self) -> None:
         """Give the port back."""
-        if self._port is not None:
-            self._port.close()
-            self._port = None
-        self._retry_at_s = float("inf")
+        self._port.close()
+        self._was_open = False
 
-    def _open(self) -> serial.Serial:
-        try:
-            return serial.Serial(self._path, self._baud, timeout=0, exclusive=True)
-        except (serial.SerialException, OSError) as error:
-            raise ModemUnavailable(_advice(self._path, error)) from error
-
-    def _reopen(self, now_s: float) -> None:
-        self._retry_at_s = now_s + REOPEN_S
-        try:
-            self._port = self._open()
-        except ModemUnavailable:
-            return
-        self._reopened += 1
-        self._notice(f"{self._path} is back", now_s)
-
-    def _guarded(self, move: Callable[[serial.Serial, float], None], now_s: float) -> None:
-        """Move bytes; a port that fails is closed and tried again later."""
-        if self._port is None:
-            return
-        try:
-            move(self._port, now_s)
-        except (serial.SerialException, OSError, TypeError) as error:
-            # pyserial raises TypeError when its descriptor vanished under it
-            self._lose(error, now_s)
-
-    def _lose(self, error: Exception, now_s: float) -> None:
-        if self._port is not None:
-            self._port.close()
-        self._port = None
-        self._retry_at_s = now_s + REOPEN_S
-        self._written = 0
-        self._reader.reset()
-        self._notice(f"{self._path} has gone ({error}); waiting for it", now_s)
-
-    def _write(self, port: serial.Serial, now_s: float) -> None:
+    def _flush(self, now_s: float) -> None:
         while self._queue:
-            try:
-                count = os.write(port.fileno(), self._queue[0][self._written :])
-            except BlockingIOError:
-                return
-            self._report("out", self._queue[0][self._written : self._written + count], now_s)
-            self._written += count
-            if self._written < len(self._queue[0]):
-                return
+            frame = self._queue[0]
+            self._written += self._port.push(frame[self._written :], now_s)
+            if self._written < len(frame):
+                break
             self._queue.popleft()
             self._written = 0
             self._sent += 1
+        self._note_loss(now_s)
 
-    def _read(self, port: serial.Serial, now_s: float) -> None:
-        if not port.in_waiting:  # raises on a port that has gone, where a read would return b""
-            return
-        data = port.read(READ_BYTES)
+    def _take(self, now_s: float) -> None:
+        data = self._port.read(now_s)
         self.bytes_read += len(data)
-        self._report("in", data, now_s)
         self._reader.receive_data(data, now_s)
         while (heard := self._reader.next_frame()) is not None:
             self._received += 1
             self._push(Reception(frame=heard.frame, toa_s=None, heard_s=heard.first_byte_s))
+        self._note_loss(now_s)
 
-    def _report(self, direction: str, data: bytes, now_s: float) -> None:
-        if self._tap is not None:
-            self._tap(direction, data, now_s)
+    def _note_loss(self, now_s: float) -> None:
+        if self._was_open and not self._port.is_open:
+            self._written = 0
+            self._reader.reset()
+            why = self._port.last_error
+            self._notice(f"{self._port.path} has gone ({why}); waiting for it", now_s)
+        self._was_open = self._port.is_open
 
     def _notice(self, text: str, now_s: float) -> None:
         self._push(LinkNotice(text=text, at_s=now_s))
@@ -184,12 +140,3 @@ def open_serial(url: ModemUrl, context: ModemContext) -> Modem:
             f"{url.text}: baud is {options['baud']}; give {SLOWEST_BAUD} to {FASTEST_BAUD}"
         )
     return SerialLineModem(url.path, options["baud"], context.tap)
-
-
-def _advice(path: str, error: Exception) -> str:
-    """Return one line that says what is wrong with a port and what to do."""
-    if not os.path.exists(path):
-        return f"{path} is not there; plug the modem in, or name another port"
-    if not os.access(path, os.R_OK | os.W_OK):
-        return f"{path} may not be opened by this user; join the group that owns it (dialout)"
-    return f"{path} cannot be opened as a serial port: {error}; is another program using it?"

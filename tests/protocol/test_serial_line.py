@@ -12,8 +12,9 @@ from protocol.codec import decode, encode
 from protocol.errors import ConfigError, ModemUnavailable, RemoteProtocolError
 from protocol.framing import wrap
 from protocol.modems.base import QUEUED_FRAMES, LinkNotice, Reception
+from protocol.modems.port import REOPEN_S
 from protocol.modems.registry import DIALECTS, open_modem
-from protocol.modems.serial_line import REOPEN_S, SerialLineModem
+from protocol.modems.serial_line import SerialLineModem
 from tests.protocol.strategies import paper_packet
 
 

@@ -141,7 +141,7 @@ class Composition:
                     moved = self._moved(closure)
                     if self._is_old(moved):
                         told = moved.from_lower_key
-                        closures[told.origin.key, told.target.key].append((number, entry, told))
+                        closures[told.origin.key, told.target.key].append((number, entry, moved))
                         continue
                     kept[number] = Entry(record=moved, active=entry.active)
                 case RangeRecord() as ranging:
@@ -228,13 +228,13 @@ class Composition:
         return chi_square <= self._settings.reject_chi_square
 
     def _one_closure(self, records: list[ClosureRecord]) -> ClosureRecord:
-        """Return their weighted mean, no surer for their number: neighbours err alike."""
-        moved_m, covariance_m2 = self._mean(records)
-        return replace(
-            records[0],
-            offset_m=records[0].offset_m + moved_m,
-            covariance_m2=covariance_m2,
-        )
+        """Return their weighted mean, no surer for their number: neighbours err alike.
+
+        Those that are told from the other end are turned round.
+        """
+        told = [record.from_lower_key for record in records]
+        moved_m, covariance_m2 = self._mean(told)
+        return replace(told[0], offset_m=told[0].offset_m + moved_m, covariance_m2=covariance_m2)
 
     def _one_fix(self, records: list[AbsoluteRecord]) -> AbsoluteRecord:
         """Return their weighted mean, no surer for their number: they share the way and a sky."""

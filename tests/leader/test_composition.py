@@ -310,6 +310,14 @@ def test_closures_told_from_both_ends_are_one() -> None:
         np.testing.assert_allclose(composed.covariance_m2, np.eye(2))
 
 
+def test_closure_that_stays_alone_is_told_as_it_was() -> None:
+    """Whoever knows its number takes it for the same offset."""
+    for record in (closure(np.eye(2)), turned(closure(np.eye(2)))):
+        (left,) = told_by(record)
+        assert (left.origin.key, left.target.key) == (record.origin.key, record.target.key)
+        np.testing.assert_array_equal(left.offset_m, record.offset_m)
+
+
 def test_closures_alike_are_as_uncertain_as_one_and_vague_ones_take_nothing_from_a_sure_one() -> (
     None
 ):

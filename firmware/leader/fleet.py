@@ -83,11 +83,8 @@ class Fleet:
             known = self._followers[header.vehicle] = _Vehicle(boot=header.boot_epoch)
         ahead = (header.boot_epoch - known.boot) % BOOT_EPOCHS
         earlier = known.boot + ahead - BOOT_EPOCHS
-        if (
-            ahead >= BOOT_EPOCHS // 2
-            and earlier >= 0
-            and self._is_late(header, known.boot, earlier)
-        ):
+        is_likely = ahead >= BOOT_EPOCHS // 2 or chain_of(header.vehicle, earlier) in self._tracks
+        if ahead and earlier >= 0 and is_likely and self._is_late(header, earlier):
             return earlier
         if ahead:
             known.boot += ahead
@@ -210,12 +207,13 @@ class Fleet:
             self.counters["lasting_jumps"] += 1
         return None
 
-    def _is_late(self, header: Header, boot: int, earlier: int) -> bool:
-        """Return whether a frame is of an earlier boot: by its time where the newest has begun."""
-        buffer = self._tracks.get(chain_of(header.vehicle, boot))
-        if buffer is None or not len(buffer):
-            return chain_of(header.vehicle, earlier) in self._tracks
-        begun_s = float(buffer.track().time_s[0])
+    def _is_late(self, header: Header, earlier: int) -> bool:
+        """Return whether a frame is of an earlier boot: by its time where a later one has begun."""
+        chain = chain_of(header.vehicle, earlier)
+        later = [c for c in self._tracks if vehicle_of(c) == header.vehicle and c > chain]
+        if not later:
+            return chain in self._tracks
+        begun_s = float(self.track(min(later)).time_s[0])
         return from_quarters(header.time_quarters, begun_s) < begun_s
 
     def _begin(self, chain: int, track: Track) -> None:

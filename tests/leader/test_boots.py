@@ -86,6 +86,30 @@ def test_late_frame_of_an_earlier_boot_does_not_start_another() -> None:
     assert len(leader.track(1).time_s) == 80
 
 
+@pytest.mark.parametrize("epoch", range(1, 16))
+def test_late_frame_is_none_of_a_new_boot_however_far_epochs_lie_apart(epoch: int) -> None:
+    """A life that no disk counts takes its epoch from the clock."""
+    leader = sailed(40.0)
+    for boot, first_s in ((0, 20.0), (epoch, 60.0), (0, 40.0), (epoch, 80.0)):
+        leader.receive_frame(
+            changed(trajectory(walked(20, 2.0 * first_s), first_s), boot_epoch=boot), None, 100.0
+        )
+    assert leader.status()["restarts"] == 1
+    assert [len(leader.fleet.track(chain).time_s) for chain in leader.graph.vehicles()[1:]] == [
+        40,
+        40,
+    ]
+
+
+def test_restart_whose_epoch_was_used_long_ago_is_not_late_by_a_clock_set_back() -> None:
+    leader = sailed(40.0)
+    for boot in range(17):
+        first_s = 20.0 * boot - 30.0 * (boot == 16)
+        frame = changed(trajectory(walked(20, 300.0 * (boot % 2)), first_s), boot_epoch=boot % 16)
+        leader.receive_frame(frame, None, 20.0 * boot + 20.0)
+    assert leader.status()["restarts"] == 16
+
+
 def test_late_frame_of_a_boot_never_heard_does_not_start_another() -> None:
     leader = sailed(40.0)
     for boot, first_s in ((1, 60.0), (0, 20.0), (1, 80.0)):

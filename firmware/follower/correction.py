@@ -100,9 +100,9 @@ class DriftCorrection:
     ) -> bool:
         """Learn from the leader's position (2,) for a past state; return whether it was believed.
 
-        A later answer for the same state replaces the earlier one. An answer older than all that
-        is kept is stale; one that the filter finds impossible is put aside until another confirms
-        it.
+        A later answer for the same state, if believed, replaces the earlier one. An answer older
+        than all that is kept is stale; one that the filter finds impossible is put aside until
+        another confirms it.
         """
         ran_away_m = np.asarray(reckoned_m - answered_m, dtype=np.float64)
         sane = np.all(np.isfinite(ran_away_m)) and np.isfinite(time_s)
@@ -112,6 +112,7 @@ class DriftCorrection:
         if time_s < self._base.time_s - 1e-6:
             self.stale += 1
             return False
+        before = self._seen, self._echo
         answer = self._news(time_s, ran_away_m, sigma_m)
         if answer is None:
             return False
@@ -119,6 +120,7 @@ class DriftCorrection:
         if self._filter.chi_square(self._state_at(time_s), answer) <= _CHI_SQUARE_2_999:
             self._take(answer)
         elif not self._confirmed(answer):
+            self._seen, self._echo = before
             return False
         self._aside = None
         self.accepted += 1

@@ -109,6 +109,20 @@ def test_single_wrong_answer_cannot_throw_the_follower_off() -> None:
     assert correction.gated == 1
 
 
+def test_answer_that_is_not_believed_takes_nothing_from_those_that_are() -> None:
+    """Neither that of the same state, nor that it may have been dead reckoning again."""
+    told, echoed = (DriftCorrection(0.0, CorrectionSettings()) for _ in range(2))
+    assert told.receive_answer(600.0, np.array([30.0, 0.0]), np.zeros(2), 2.0)
+    assert echoed.receive_answer(40.0, np.zeros(2), np.zeros(2))
+    for correction, time_s in ((told, 600.0), (echoed, 60.0)):
+        before = correction.corrected(620.0, np.array([30.0, 0.0]))
+        assert not correction.receive_answer(time_s, np.zeros(2), np.array([2000.0, 0.0]))
+        for was, left in zip(
+            before, correction.corrected(620.0, np.array([30.0, 0.0])), strict=True
+        ):
+            np.testing.assert_array_equal(left, was)
+
+
 def test_leader_that_changes_its_mind_twice_alike_is_believed() -> None:
     correction = DriftCorrection(0.0, CorrectionSettings())
     for time_s in (80.0, 120.0, 160.0, 200.0):

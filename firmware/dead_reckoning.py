@@ -57,6 +57,7 @@ class DeadReckoning:
             if self._backward < _SET_BACK_SAMPLES:
                 return self.state
             self.set_back += 1
+            self._measured_s += interval_s
             interval_s = 0.0
         self._backward = 0
         velocity_mps = (odometry.velocity_north_mps, odometry.velocity_east_mps)

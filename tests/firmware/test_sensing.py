@@ -95,6 +95,21 @@ def test_dead_reckoning_goes_on_when_its_clock_was_set_back(back_s: float) -> No
     assert (reckoning.set_back, reckoning.bad_samples) == (1, 5)
 
 
+@pytest.mark.parametrize("back_s", [0.0, 300.0])
+def test_a_clock_set_back_while_there_is_no_bottom_lock_leaves_the_way_unknown(
+    back_s: float,
+) -> None:
+    reckoning = DeadReckoning(dataclasses.replace(START, time_s=399.0))
+    for k in range(4):
+        reckoning.receive_odometry(odometry(399.25 + 0.25 * k))
+    here_m, lost_s = reckoning.state.north_m, 0.0
+    for k in range(1, 401):
+        reckoning.receive_odometry(odometry(400.0 - back_s + 0.25 * k, np.nan))
+        lost_s += reckoning.lost_s
+    assert lost_s == pytest.approx(95.0, abs=2.0)
+    assert reckoning.state.north_m - here_m <= 10.0
+
+
 def test_dead_reckoning_takes_single_late_samples_for_no_clock_set_back() -> None:
     reckoning = DeadReckoning(START)
     for k in range(1, 101):

@@ -90,7 +90,9 @@ class FollowerCore:
             self._track.pop()
             self._last_submap_s = min(self._last_submap_s, state.time_s)
         if self._reckoning.lost_s > 0.0:
-            self._lose(state)
+            self._correction.lose(state.time_s - self._reckoning.lost_s, state.time_s)
+        if self._reckoning.is_lost:
+            self._tear(state)
             return
         if self._is_lost:
             self._begin_boot()
@@ -183,14 +185,13 @@ class FollowerCore:
             "ranges_gated": self._correction.ranges_gated,
         }
 
-    def _lose(self, state: ReckonedState) -> None:
-        """Doubt the way since the last state, and send what was measured before it by itself."""
+    def _tear(self, state: ReckonedState) -> None:
+        """Send what was measured before navigation was lost by itself."""
         self._is_lost = True
         self._builder.tear(state)
         torn = self._builder.take()
         if torn is not None:
             self._begin_fit(torn)
-        self._correction.lose(state.time_s - self._reckoning.lost_s, state.time_s)
 
     def _begin_boot(self) -> None:
         """Tell the leader that dead reckoning begins anew, as after a restart."""

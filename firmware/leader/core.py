@@ -104,7 +104,9 @@ class LeaderCore:
         """Advance dead reckoning; a finished sub-map becomes a sheet of the atlas."""
         state = self._reckoning.receive_odometry(odometry)
         if self._reckoning.lost_s > 0.0:
-            self._lose(state)
+            self.graph.lose(LEADER, state.time_s - self._reckoning.lost_s, state.time_s)
+        if self._reckoning.is_lost:
+            self._tear(state)
         else:
             self._builder.receive_state(state)
         if odometry.fix is not None:
@@ -270,14 +272,13 @@ class LeaderCore:
             self.atlas.shelve(sheet_id)
         self.outlook.note(newest_s)
 
-    def _lose(self, state: ReckonedState) -> None:
-        """Doubt the way since the last state; what was measured before it stands by itself."""
+    def _tear(self, state: ReckonedState) -> None:
+        """Let what was measured before navigation was lost stand by itself."""
         self._builder.tear(state)
         torn = self._builder.take()
         if torn is not None:
             self._add_own(torn)
         self._stretches.clear()
-        self.graph.lose(LEADER, state.time_s - self._reckoning.lost_s, state.time_s)
 
     def _add_own(self, stretch: Submap) -> None:
         """Join the newest stretches to a sub-map, so that one ends every hop."""

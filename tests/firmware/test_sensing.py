@@ -107,7 +107,7 @@ def test_a_clock_set_back_while_there_is_no_bottom_lock_leaves_the_way_unknown(
         reckoning.receive_odometry(odometry(400.0 - back_s + 0.25 * k, np.nan))
         lost_s += reckoning.lost_s
     assert lost_s == pytest.approx(95.0, abs=2.0)
-    assert reckoning.state.north_m - here_m <= 10.0
+    assert reckoning.state.north_m - here_m <= 20.0
 
 
 def test_dead_reckoning_takes_single_late_samples_for_no_clock_set_back() -> None:

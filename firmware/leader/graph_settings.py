@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware.leader.wander import reckoned_m2
+from protocol.errors import ConfigError
 from protocol.settings import Settings, setting
 
 _SOUND_MPS = 1500.0  # turns times into ranges; a prior needs it no better
@@ -71,6 +72,15 @@ class GraphSettings(Settings):
     robust_kernel: float = setting(
         3.0, "sigma", "Huber: convex, so that large true innovations cannot stick", minimum=0.1
     )
+
+    def __post_init__(self) -> None:
+        # super() does not survive the new class that slots=True makes
+        Settings.__post_init__(self)
+        if self.alike_interval_s % self.node_interval_s:  # no node would be at such a time
+            raise ConfigError(
+                f"alike_interval_s is {self.alike_interval_s} s; it must be a multiple of"
+                f" node_interval_s, {self.node_interval_s} s"
+            )
 
     @property
     def clock_offset_sigma_m(self) -> float:

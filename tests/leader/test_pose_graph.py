@@ -17,7 +17,7 @@ from firmware.leader.ledger import (
 )
 from firmware.leader.pose_graph import PoseGraph
 from firmware.submaps import Track
-from protocol.errors import EstimationError
+from protocol.errors import ConfigError, EstimationError
 
 SETTINGS = GraphSettings()
 
@@ -203,6 +203,13 @@ def test_current_that_turns_for_one_vehicle_turns_for_the_other() -> None:
         graph.update()
         misses_m.append(float(np.abs(graph.trajectory(1).position_m[-1, 0])))
     assert misses_m[0] < 0.5 * misses_m[1]
+
+
+def test_vehicles_that_would_never_be_tied_are_refused() -> None:
+    assert GraphSettings(node_interval_s=7.5, alike_interval_s=60.0)
+    for node_s, alike_s in ((8.0, 60.0), (10.0, 45.0), (1.1, 11.0)):
+        with pytest.raises(ConfigError, match="multiple of node_interval_s"):
+            GraphSettings(node_interval_s=node_s, alike_interval_s=alike_s)
 
 
 def test_range_says_nothing_of_a_compass_that_turns_the_whole_map() -> None:

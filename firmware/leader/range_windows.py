@@ -207,7 +207,10 @@ class RangeWindows:
             self.counters["ranges_left_rough"] += len(placed)
             return _Fate.ENTERED
         s, middle = self._settings, placed[len(placed) // 2]
-        along_m, bent_m = _spread(middle, graph)
+        try:
+            along_m, bent_m = _spread(middle, graph)
+        except EstimationError:
+            return _Fate.UNDECIDED
         roughly = bent_m > s.bent_m
         if roughly and bent_m > min(0.5 * window.bent_m, s.bent_share * middle.predicted_m):
             return _Fate.BENT

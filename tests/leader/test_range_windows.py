@@ -111,6 +111,16 @@ def test_a_range_that_has_no_place_leaves_its_window_once(monkeypatch: pytest.Mo
     assert [held.sent_s for held in ranging._waiting[1][0].held] == [16, 24]
 
 
+def test_windows_wait_while_the_graph_tells_no_covariance() -> None:
+    ranging, graph = RangeWindows(RangeSettings()), MagicMock()
+    graph.clock.return_value, graph.position.return_value = (0.0, 0.0), np.zeros(2)
+    graph.covariance.side_effect = EstimationError("the information matrix is singular")
+    for begin_s in (8, 200):
+        _heard(ranging, begin_s, begin_s + 24)
+        ranging.use(1, _track(begin_s + 24), 0, _track(begin_s + 24), graph)
+    assert [len(window.held) for window in ranging._waiting[1]] == [3, 3]
+
+
 @pytest.mark.parametrize("late_s", [0.0, 0.001, 60.0])
 def test_impossible_ranges_are_counted_and_not_held(late_s: float) -> None:
     ranging = RangeWindows(RangeSettings())

@@ -177,6 +177,8 @@ class Judgement:
 
     def _map_agrees(self, closure: Closure, atlas: Atlas, graph: PoseGraph) -> bool:
         """Ask neighbouring sub-maps, carried along by dead reckoning, whether they fit as well."""
+        if closure.origin not in atlas or closure.target not in atlas:  # dropped meanwhile
+            return False
         origin, target = atlas[closure.origin], atlas[closure.target]
         windows = [
             self._window(closure, (origin, target), pair, graph)

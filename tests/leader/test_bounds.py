@@ -2,6 +2,7 @@
 
 import pickle
 from typing import cast
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -11,9 +12,10 @@ from firmware.leader.atlas import Atlas, Sheet, SheetId, sheet_of
 from firmware.leader.closure_log import ClosureLog, verdict_of
 from firmware.leader.closures import Closure, Stage
 from firmware.leader.coverage import CoverageSettings, redundant
+from firmware.leader.judgement import Judgement, JudgementSettings
 from firmware.leader.ledger import Anchor
 from firmware.leader.match_jobs import MatchJob, SheetJobs
-from firmware.leader.matches import MatchOutcome, NoMatch
+from firmware.leader.matches import MatchingSettings, MatchOutcome, NoMatch
 from firmware.leader.shelf import MemoryShelf, packed, unpacked
 from firmware.submaps import GriddedSubmap, Track
 
@@ -156,6 +158,14 @@ def test_corrections_decide_which_place_is_covered() -> None:
     sheets = [sheet_at(0.0, k) for k in range(3)]
     moves_m = np.array([[0.0, 0.0], [300.0, 0.0], [600.0, 0.0]])
     assert redundant(sheets, moves_m, CoverageSettings(layers=1)) == []
+
+
+def test_a_closure_whose_sub_map_was_dropped_meanwhile_is_asked_no_map() -> None:
+    judgement = Judgement(JudgementSettings(), MatchingSettings())
+    closure = closure_at(900.0, None)
+    closure.stage, closure.active, closure.predicted_sigma_m = Stage.GATED, False, 20.0
+    judgement.consider([closure], Atlas(4), MagicMock())
+    assert list(judgement._waiting) == [closure]
 
 
 def test_verdicts_read_back_exactly() -> None:

@@ -3,6 +3,7 @@
 A closure stays at hand while something may yet be decided on it; then only its verdict is kept.
 """
 
+import logging
 from collections import Counter, deque
 from collections.abc import Iterator
 
@@ -10,7 +11,7 @@ from firmware.leader.atlas import Atlas, Sheet
 from firmware.leader.closure_log import ClosureLog, Verdict, verdict_of
 from firmware.leader.closures import Closure, closure_of, gated
 from firmware.leader.judgement import Judgement
-from firmware.leader.match_jobs import Findings, SheetJobs, jobs_for
+from firmware.leader.match_jobs import Findings, MatchJob, SheetJobs, jobs_for
 from firmware.leader.nonconvexity import Doubt
 from firmware.leader.open_pairs import OpenPairs
 from firmware.leader.pairing import Calibrations
@@ -18,6 +19,7 @@ from firmware.leader.pose_graph import PoseGraph
 from firmware.leader.settings import LeaderSettings
 from protocol.errors import EstimationError
 
+LOG = logging.getLogger(__name__)
 _SHEETS_WAITING = 16  # five minutes of own sub-maps
 
 
@@ -54,16 +56,22 @@ class LoopClosing:
         return bool(self._waiting)
 
     def next_jobs(self) -> SheetJobs | None:
-        """Return the matches of the oldest sheet that still waits for them, or None."""
+        """Return the matches of the oldest sheet that still waits for them, or None.
+
+        Where they cannot be made it has none; second looks and a doubt go out all the same.
+        """
         if not self._waiting:
             return None
         self._graph.update()
         sheet, settings = self._waiting.popleft(), self._settings.closures
+        jobs: list[MatchJob] = []
         try:
             jobs = jobs_for(sheet, self._atlas, self._graph, settings, self._calibrations)
         except EstimationError:
             self._counters["submaps_unplaceable"] += 1
-            jobs = []
+        except Exception:
+            LOG.exception("the matches of %s cannot be made", sheet.id)
+            self._counters["submaps_unmatched"] += 1
         looks = self._open.second_looks(sheet, self._atlas, self._graph, self._calibrations)
         doubt, self._doubt = self._doubt, None
         self.is_matching = True

@@ -6,6 +6,7 @@ Until then it may leave a hint. Neighbouring pairs mistake the same hill for the
 what the second and third of them say counts for less.
 """
 
+import logging
 from collections import Counter, OrderedDict, deque
 from dataclasses import dataclass, replace
 
@@ -19,6 +20,7 @@ from firmware.leader.pairing import Calibrations
 from firmware.leader.pose_graph import PoseGraph
 from protocol.errors import EstimationError
 
+LOG = logging.getLogger(__name__)
 _HEARD = 512  # hints whose neighbours are told from others
 _ALIKE_S = 90.0  # between the middles of sub-maps that see much of the same ground
 _OPEN = (NoMatch.AMBIGUOUS, NoMatch.LOOSE)  # what a narrower prior may decide
@@ -120,6 +122,9 @@ class OpenPairs:
                 looks += jobs_again(*turn, graph, self._settings, calibrations)
             except EstimationError:
                 self.counters["second_looks_unplaceable"] += 1
+            except Exception:
+                LOG.exception("second looks at %s failed", turn[0].id)
+                self.counters["second_looks_raised"] += 1
         self.counters["second_looks"] += len(looks)
         return looks
 

@@ -1,23 +1,27 @@
 """A pair that a match left open is looked at again once its offset is known much better."""
 
 import dataclasses
+from collections import Counter
 from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 
+from firmware.leader import loop_closing, open_pairs
 from firmware.leader.atlas import Atlas, Sheet, SheetId, sheet_of
 from firmware.leader.closure_settings import ClosureSettings
 from firmware.leader.closures import closure_of, enter_hint
 from firmware.leader.displacement import Look
 from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.judgement import Judgement, JudgementSettings
+from firmware.leader.loop_closing import LoopClosing
 from firmware.leader.match_jobs import MatchJob, jobs_again
 from firmware.leader.matches import Hint, Match, MatchingSettings, MatchOutcome, NoMatch
 from firmware.leader.offsets import offsets_of
 from firmware.leader.open_pairs import OpenPairs
 from firmware.leader.pairing import Calibrations
 from firmware.leader.pose_graph import PoseGraph
+from firmware.leader.settings import LeaderSettings
 from firmware.submaps import GriddedSubmap, Track
 
 AMBIGUOUS = MatchOutcome(match=None, reason=NoMatch.AMBIGUOUS)
@@ -232,6 +236,44 @@ def test_no_sheet_has_two_turns_beside_a_new_one(atlas: Atlas, graph: PoseGraph)
     pairs.second_looks(fourth, atlas, graph, calibrations)
     assert len(pairs) == 1
     assert pairs.second_looks(third, atlas, graph, calibrations) == []
+
+
+def test_a_second_look_that_raises_takes_nothing_else_along(
+    atlas: Atlas, graph: PoseGraph, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where what a pair has told is all that is known of it."""
+    first, second, third, fourth = _sheets(atlas)
+    counters = Counter[str]()
+    closing = LoopClosing(graph, atlas, LeaderSettings(), counters)
+    for target in (second, third):
+        closing._open.note(_job(first, target, 1e6), AMBIGUOUS)
+    closing.add(fourth)
+    closing._doubt = doubt = MagicMock()
+
+    def looks(sheet: Sheet, *_: object) -> list[MatchJob]:
+        if sheet is third:
+            raise np.linalg.LinAlgError("Singular matrix")
+        return [_job(first, sheet, 1.0)]
+
+    monkeypatch.setattr(open_pairs, "jobs_again", looks)
+    batch = closing.next_jobs()
+    assert batch is not None
+    assert (batch.sheet, batch.doubt) == (fourth, doubt)
+    assert second in [job.target for job in batch.jobs]
+    assert closing.status()["second_looks_raised"] == 1
+
+
+def test_first_looks_that_raise_leave_a_sheet_its_second_ones(
+    atlas: Atlas, graph: PoseGraph, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counters = Counter[str]()
+    closing = LoopClosing(graph, atlas, LeaderSettings(), counters)
+    closing.add(_sheets(atlas)[0])
+    monkeypatch.setattr(loop_closing, "jobs_for", MagicMock(side_effect=ValueError("no such grid")))
+    batch = closing.next_jobs()
+    assert batch is not None
+    assert batch.jobs == ()
+    assert counters["submaps_unmatched"] == 1
 
 
 @pytest.mark.parametrize("outcome", [AMBIGUOUS, UNSETTLED])

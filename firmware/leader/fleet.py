@@ -226,15 +226,17 @@ class Fleet:
             return
         before, old = earlier[-1], self.track(earlier[-1])
         self._graph.extend(before, old)
-        last_s = min(float(old.time_s[-1]), time_s)
-        gap_s = time_s - last_s
+        last_s = float(old.time_s[-1])
+        gap_s = max(time_s - last_s, 0.0)
         trajectory = self._graph.trajectory(before)
         expected_m = trajectory.correct(last_s, old.position_at(last_s))
         moved_m, sigma_m = np.zeros(2), self._settings.fastest_mps / 2 * gap_s + 5.0
         velocity_mps = (old.position_at(last_s) - old.position_at(last_s - 5.0)) / 5.0
         on_m = start_m - old.position_at(last_s)
         goes_on = np.hypot(*(on_m - velocity_mps * gap_s)) < _CONTINUES_M + 0.2 * np.sqrt(gap_s)
-        if goes_on and np.hypot(*on_m) > _HELD_M:
+        if time_s < last_s:  # by a clock set back: nobody knows how long ago the old one ended
+            moved_m, sigma_m = on_m, 5.0 + float(np.hypot(*on_m))
+        elif goes_on and np.hypot(*on_m) > _HELD_M:
             moved_m, sigma_m = on_m - trajectory.bias_at(last_s) * gap_s, 1.0 + 0.02 * gap_s
         self._graph.add_vehicle(
             chain, time_s, start_m, expected_m + moved_m, start_sigma_m=1e4, like=before

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from firmware.leader.ledger import ClosureRecord
 from protocol.codec import decode
 from tests.leader.vessels import (
     changed,
@@ -169,3 +170,24 @@ def test_follower_whose_clock_is_set_back_is_heard_again() -> None:
         leader.receive_frame(trajectory(walked(20, 2.0 * now_s), theirs_s), None, float(now_s))
     assert leader.track(1).time_s[-1] >= 239.0
     assert leader.vehicles() == [0, 1]
+
+
+@pytest.mark.parametrize("jump_m", [0.0, 300.0])
+def test_track_after_a_clock_was_set_back_is_where_it_was_or_the_tie_says_so(jump_m: float) -> None:
+    leader = sailed()
+    for time_s in range(101, 1000):
+        leader.fleet.own.add(float(time_s), 2.0 * time_s, 0.0, 0.0)
+    for first_s in range(0, 900, 20):
+        theirs_s = first_s - 100.0 * (first_s >= 600)
+        states = walked(20, 2.0 * first_s + jump_m * (first_s >= 600))
+        leader.receive_frame(trajectory(states, theirs_s), None, first_s + 40.0)
+    assert leader.status()["lasting_jumps"] == 1
+    newest, graph = leader.fleet.newest_chain(1), leader.graph
+    track = leader.fleet.track(newest)
+    begun_s, true_m = float(track.time_s[0]), np.array([track.north_m[0] - jump_m, 0.0])
+    miss_m = graph.position(graph.anchor(newest, begun_s, track)) - true_m
+    assert np.hypot(*miss_m) < 1.5 * jump_m + 5.0
+    assert miss_m @ np.linalg.solve(graph.predicted_covariance(newest, begun_s), miss_m) < 3.0
+    (tie,) = [e.record for e in graph._ledger.values() if isinstance(e.record, ClosureRecord)]
+    apart_m = tie.offset_m - (true_m - [2.0 * 599.0, 0.0])
+    assert apart_m @ np.linalg.solve(tie.covariance_m2, apart_m) < 3.0

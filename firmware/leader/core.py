@@ -111,10 +111,13 @@ class LeaderCore:
             self._builder.receive_state(state)
         if odometry.fix is not None:
             self._fixes.hold(odometry.time_s, odometry.fix)
-        track = self.fleet.own
-        if abs(state.time_s - self._tracked_s) >= 1.0 - 1e-6:  # back where a clock was set back
+        if state.time_s < self._tracked_s:
+            self.fleet.own.forget_from(state.time_s)
+            self.graph.set_back(LEADER, self._tracked_s, state.time_s)
+            self._tracked_s = -math.inf
+        if state.time_s - self._tracked_s >= 1.0 - 1e-6:
             self._tracked_s = state.time_s
-            track.add(state.time_s, state.north_m, state.east_m, state.yaw_rad)
+            self.fleet.own.add(state.time_s, state.north_m, state.east_m, state.yaw_rad)
         submap = self._builder.take()
         if submap is not None:
             self._add_own(submap)

@@ -11,6 +11,7 @@ import itertools
 import gtsam
 import numpy as np
 
+from firmware.dead_reckoning import LOST_SIGMA_MPS
 from firmware.geometry import Array
 from firmware.leader.chains import Chain, shared_walk
 from firmware.leader.composition import (
@@ -32,7 +33,7 @@ from firmware.leader.ledger import (
     Record,
     SharedDriftRecord,
 )
-from firmware.leader.wander import expected_walk, likely_walk
+from firmware.leader.wander import expected_walk, likely_walk, reckoned_m2
 from firmware.submaps import Track
 
 _STEADY_M_PER_H = 0.01  # of a clock whose rate is not asked for
@@ -113,6 +114,19 @@ class PoseGraph(Estimate):
     def lose(self, vehicle: int, begin_s: float, end_s: float) -> None:
         """Say of a span, before it has nodes, that nobody knows how far a vehicle went in it."""
         self._chains[vehicle].lose(begin_s, end_s)
+
+    def set_back(self, vehicle: int, from_s: float, to_s: float) -> None:
+        """Doubt the way on from a vehicle's newest node, since its clock was set back.
+
+        Once the clock has caught up with that node it tells of less time than may have passed: the
+        way is as unsure as dead reckoning for as long, as if navigation had been lost.
+        """
+        chain, s = self._chains[vehicle], self._settings
+        passed_m2 = reckoned_m2(
+            from_s - to_s, s.odometry_noise, self._walk, drift_mps=s.bias_sigma_mps
+        )
+        newest_s = chain.times_s[-1]
+        chain.lose(newest_s, newest_s + float(np.sqrt(passed_m2)) / LOST_SIGMA_MPS)
 
     def add_closure(
         self, origin: Anchor, target: Anchor, offset_m: Array, covariance_m2: Array, *, active: bool

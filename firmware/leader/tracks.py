@@ -54,6 +54,15 @@ class TrackBuffer:
                 return False
         return True
 
+    def forget_from(self, time_s: float) -> None:
+        """Forget the states from a time on: the clock was set back to it."""
+        self.track()
+        self._columns = self._columns[:, self._columns[0] < time_s]
+        self._states = {
+            quarter: state for quarter, state in self._states.items() if state[0] < time_s
+        }
+        self._newest = max(self._states, default=None)
+
     def track(self) -> Track:
         """Return all states as arrays; sorted again only when an old one arrived late."""
         if self._fresh:

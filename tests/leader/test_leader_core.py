@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from firmware.leader.core import LeaderCore
+from firmware.leader.ledger import OdometryRecord
 from firmware.leader.settings import LeaderSettings, reassembly_of
 from protocol.codec import decode, encode
 from protocol.packets import (
@@ -240,6 +241,30 @@ def test_own_sub_map_does_not_reach_over_a_clock_that_is_set_back(back_s: float)
         sail(leader, path, 0.25 * k - back_s * (k >= 440))
     assert leader.status()["odometry_set_back"] == 1
     assert all((np.diff(sheet.track.time_s) > 0.0).all() for sheet in leader.atlas)
+
+
+def test_own_track_is_right_after_a_clock_that_was_ahead() -> None:
+    """Nodes of a minute lie ahead; the way on from them is as unsure as the time till then."""
+    path = line(0.0, 0.0)
+    leader = leader_of(path)
+    for k in range(1, 4 * 700):
+        now_s = 0.25 * k
+        if now_s % 10.0 == 0.0:
+            leader.fleet.extend(0)
+        sail(leader, path, now_s + 300.0 * (300.0 <= now_s < 360.0), sonar_on=False)
+    track, graph = leader.track(0), leader.graph
+    assert leader.status()["odometry_set_back"] == 1
+    times_s = np.arange(370.0, 699.0)
+    assert track.position_at(times_s) == pytest.approx(
+        np.array([path(t) for t in times_s]), abs=6.0
+    )
+    (across,) = [
+        entry.record
+        for entry in graph._ledger.values()
+        if isinstance(entry.record, OdometryRecord) and entry.record.moved_m[0] > 100.0
+    ]
+    assert across.interval_s == 10.0
+    assert across.position_sigma_m > 20.0
 
 
 @pytest.mark.parametrize("toa_s", [np.nan, np.inf, -np.inf, 5000.0, 30.0])

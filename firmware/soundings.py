@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware.geometry import Array, rotation_ned_body
+from protocol.packets import DEEPEST_M, HIGHEST_M
 from protocol.settings import Settings, setting
 
 
@@ -76,13 +77,15 @@ def soundings_from_ping(
     """Return the soundings of a ping (N, 3) as north, east, depth, and the count of bad beams.
 
     The beam (0, sin a, cos a) r of the body plus the lever arm is turned into NED and added to the
-    vehicle's position. Lost, non-finite and out-of-range beams are left out and counted.
+    vehicle's position. Lost, non-finite and out-of-range beams are left out and counted, and all of
+    a ping from a depth that no vehicle has.
     Source: paper, section 3 (X_MP and h_MP of a measured point).
     """
     ranges_m = np.asarray(ping.slant_ranges_m, dtype=np.float64)
     angles_rad = np.asarray(ping.beam_angles_rad, dtype=np.float64)
     pose = (ping.roll_rad, ping.pitch_rad, ping.yaw_rad, ping.depth_m, north_m, east_m)
-    if ranges_m.ndim != 1 or ranges_m.shape != angles_rad.shape or not np.all(np.isfinite(pose)):
+    is_somewhere = bool(np.isfinite(pose).all()) and HIGHEST_M <= ping.depth_m <= DEEPEST_M
+    if ranges_m.ndim != 1 or ranges_m.shape != angles_rad.shape or not is_somewhere:
         return np.empty((0, 3)), ranges_m.size
     with np.errstate(invalid="ignore"):
         good = (

@@ -63,8 +63,11 @@ def test_beam_that_no_echo_can_make_is_left_out_and_counted(bad_m: float) -> Non
     assert bad == 1
 
 
-def test_ping_without_attitude_gives_no_soundings() -> None:
-    soundings_m, bad = soundings_from_ping(ping(roll_rad=np.nan), 0.0, 0.0, SonarSettings())
+@pytest.mark.parametrize(
+    "change", [{"roll_rad": np.nan}, {"depth_m": 1e6}, {"depth_m": -1e4}, {"depth_m": np.inf}]
+)
+def test_ping_without_attitude_or_at_no_depth_gives_no_soundings(change: dict[str, float]) -> None:
+    soundings_m, bad = soundings_from_ping(ping(**change), 0.0, 0.0, SonarSettings())
     assert soundings_m.shape == (0, 3)
     assert bad == 3
 

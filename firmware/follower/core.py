@@ -128,7 +128,7 @@ class FollowerCore:
         self._receive_answer(packet, now_s)
 
     def tick(self, now_s: float) -> None:
-        """Do one slice of the fit; queue its packets when it is done or its first slot is due."""
+        """Do one slice of the fit, whatever the time; queue its packets when it is done."""
         del now_s
         if self._fit is None:
             return

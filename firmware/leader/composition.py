@@ -183,7 +183,8 @@ class Composition:
     def _moved(self, record: Link) -> Link:
         """Return a record between nodes that stay, as uncertain as the ways to them make it.
 
-        The closures of a piece share those ways: each has to count them as often as there are some.
+        The closures of a piece share those ways, and may be as many as a piece keeps: each counts
+        them as often as that, however many there are, and so does each range.
         """
         ends = record.origin, record.target
         apart_m2 = [self._apart_m2[end.key] for end in ends if end.key in self._owners]
@@ -204,7 +205,11 @@ class Composition:
     def _thinned(
         self, closures: Mapping[tuple[int, int], Group[ClosureRecord]]
     ) -> list[Group[ClosureRecord]]:
-        """Return the groups that stay: of each piece those with the oldest others."""
+        """Return what stays of the groups: their active closures that the estimate believes.
+
+        A group belongs to the newer of its two pieces; of each piece those with the oldest others
+        stay. What lies within one piece goes.
+        """
         by_piece: dict[int, list[tuple[float, Group[ClosureRecord]]]] = defaultdict(list)
         for (origin, target), group in closures.items():
             believed = [item for item in group if item[1].active and self._is_true(item[2])]

@@ -20,8 +20,8 @@ class Anchor:
     """A node, the offset by dead reckoning from it to the position that is meant, and a lever.
 
     The offset drifts with the node's bias for lag_s. The lever leads from the position to a place
-    that the sonar saw. Both are told in the frame of the vehicle's own compass, and turn and
-    stretch with its parameters.
+    that the sonar saw. Both are told in the frame of the vehicle's own compass, and turn with its
+    heading bias; the offset, which the log measured, stretches with its scale as well.
     """
 
     key: int

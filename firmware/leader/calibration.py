@@ -6,7 +6,7 @@ of depth offset, shift (with the graph's prior) and swath errors gives informati
 smile, which is summed recursively and slowly forgotten, because water changes.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -202,14 +202,7 @@ def _pure(grid: GriddedSubmap, swath: Swath | None) -> GriddedSubmap:
     """Return the grid where its across-track distance means something."""
     if swath is None:
         return grid
-    return GriddedSubmap(
-        north0_m=grid.north0_m,
-        east0_m=grid.east0_m,
-        cell_m=grid.cell_m,
-        depth_m=np.where(swath.pure, grid.depth_m, np.nan),
-        variance_m2=grid.variance_m2,
-        time_s=grid.time_s,
-    )
+    return replace(grid, depth_m=np.where(swath.pure, grid.depth_m, np.nan))
 
 
 def _basis(swath: Swath | None, grid: GriddedSubmap, cropped: GriddedSubmap) -> Array:

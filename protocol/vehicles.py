@@ -3,7 +3,7 @@
 LEADER = 0
 """Followers are 1 and up."""
 
-BOOT_EPOCHS = 16
+VEHICLES = BOOT_EPOCHS = 16
 """The header has four bits each for the vehicle and its boot epoch."""
 
 

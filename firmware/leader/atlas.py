@@ -12,7 +12,7 @@ from firmware.leader.shelf import MemoryShelf, Shelf, packed, unpacked
 from firmware.leader.trajectory import Trajectory
 from firmware.leader.warping import remove_drift
 from firmware.submaps import GriddedSubmap, Track
-from protocol.vehicles import BOOT_EPOCHS, LEADER
+from protocol.vehicles import LEADER, VEHICLES
 
 FOOTPRINT_M = 10.0
 """Tiles in which footprints are compared: a tenth of a sub-map."""
@@ -20,12 +20,12 @@ FOOTPRINT_M = 10.0
 
 def chain_of(vehicle: int, boot: int) -> int:
     """Return the number of the graph's chain for a boot of a vehicle; the leader has one."""
-    return LEADER if vehicle == LEADER else boot * BOOT_EPOCHS + vehicle
+    return LEADER if vehicle == LEADER else boot * VEHICLES + vehicle
 
 
 def vehicle_of(chain: int) -> int:
     """Return the vehicle whose chain it is."""
-    return chain % BOOT_EPOCHS
+    return chain % VEHICLES
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

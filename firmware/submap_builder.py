@@ -40,11 +40,10 @@ class SubmapBuilder:
         settings: SubmapSettings,
         sonar: SonarSettings,
         binning: BinningSettings,
-        first_index: int = 0,
     ) -> None:
         self._vehicle, self.boot_epoch = vehicle, boot_epoch
         self._settings, self._sonar, self._binning = settings, sonar, binning
-        self._index = first_index
+        self._index = 0
         self._bins = SoundingBins(binning)
         self._states: list[ReckonedState] = []
         self._window: int | None = None

@@ -149,10 +149,6 @@ class Estimate:
             raise EstimationError(f"record {number} is not a closure")
         return record
 
-    def innovation(self, number: int) -> Array:
-        """Return estimated minus measured offset (2,) of a closure, in metres."""
-        return self.closure(number).innovation_m(self._state)
-
     def doubt(self, closures: Mapping[int, bool], limits: tuple[float, float]) -> Doubt:
         """Return closures, and whether each is active, as doubted by all else that is believed.
 

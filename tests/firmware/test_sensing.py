@@ -141,8 +141,8 @@ def test_builder_closes_a_submap_at_the_end_of_its_window_and_numbers_wrap() -> 
         settings=SubmapSettings(duration_s=8.0),
         sonar=SonarSettings(),
         binning=BinningSettings(),
-        first_index=65535,
     )
+    builder._index = 65535
     reckoning, submaps = DeadReckoning(START), []
     for time_s in np.arange(0.0, 24.25, 0.25):
         state = reckoning.receive_odometry(odometry(float(time_s)))

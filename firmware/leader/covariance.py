@@ -16,16 +16,14 @@ class Refined:
 
     covariance_m2 (2, 2) is of the shift, a kilometre along a direction without any information;
     walk_m2 is to be added to each axis for the random walk of dead reckoning while the overlap was
-    measured. variance_m2 is the predicted mean variance of a cell's difference; misfit the mean of
-    squared normalised residuals (1 when the model holds). centre_m (2,) is the overlap's middle on
-    the reference.
+    measured. variance_m2 is the predicted mean variance of a cell's difference. centre_m (2,) is
+    the overlap's middle on the reference.
     """
 
     shift_m: Array
     covariance_m2: Array
     walk_m2: float
     variance_m2: float
-    misfit: float
     overlap_cells: int
     centre_m: Array
     reference_time_s: float
@@ -47,7 +45,6 @@ def measure(field: Aligned, noise: NoiseModel) -> Refined:
         covariance_m2=covariance,
         walk_m2=noise.walk_m2_per_s * walk_s,
         variance_m2=float(np.sum(field.variance_m2 * field.both) / cells),
-        misfit=misfit,
         overlap_cells=int(cells),
         centre_m=field.centre_m,
         reference_time_s=field.spans[0].mean_s,

@@ -127,9 +127,7 @@ class Match:
     The shift holds between reference_time_s and query_time_s, the mean times at which the two
     measured the overlap. covariance_m2 (2, 2) is the measurement's own, without the prior. axis_deg
     is None, or the direction from north in which a one-axis closure holds; across it the covariance
-    is wide. false_mass is the posterior probability that the true shift lies outside the winner's
-    basin (outside its line, for one axis). centre_m (2,) is the overlap's middle in the reference's
-    coordinates.
+    is wide. centre_m (2,) is the overlap's middle in the reference's coordinates.
     """
 
     shift_m: Array
@@ -137,9 +135,6 @@ class Match:
     residual: float
     overlap_cells: int
     axis_deg: float | None
-    false_mass: float
-    log_evidence: float
-    misfit: float
     variance_m2: float
     centre_m: Array
     reference_time_s: float

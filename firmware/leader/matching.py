@@ -231,13 +231,12 @@ def _decide(
     certain = elsewhere.false_mass <= settings.false_mass_limit
     walk = np.eye(2) * refined.walk_m2
     if certain and sigmas[1] <= settings.sigma_limit_m:
-        return _closure(refined, residual, evidence, covariance + walk, None, elsewhere.false_mass)
+        return _closure(refined, residual, covariance + walk, None)
     free_m = np.sqrt(vectors[:, 1] @ prior.covariance_m2 @ vectors[:, 1])
     if certain and min(sigmas[1] / 2.0, free_m) <= settings.basin_m:
-        axis, false_mass = vectors[:, 0], elsewhere.false_mass
+        axis = vectors[:, 0]
     elif not certain and elsewhere.false_mass_off_line <= settings.false_mass_limit:
         axis = np.array([np.cos(elsewhere.axis_rad), np.sin(elsewhere.axis_rad)])
-        false_mass = elsewhere.false_mass_off_line
     else:
         return _none(NoMatch.AMBIGUOUS)
     line = ambiguity.ridge_of(*ridge, prior, refined.shift_m, axis)
@@ -248,16 +247,11 @@ def _decide(
         return _none(NoMatch.LOOSE)
     wide = along * np.outer(axis, axis) + _FREE_M**2 * np.outer(across, across)
     axis_deg = float(np.degrees(np.arctan2(axis[1], axis[0])) % 180.0)
-    return _closure(refined, residual, evidence, wide + walk, axis_deg, false_mass)
+    return _closure(refined, residual, wide + walk, axis_deg)
 
 
 def _closure(
-    refined: Refined,
-    residual: float,
-    log_evidence: float,
-    covariance_m2: Array,
-    axis_deg: float | None,
-    false_mass: float,
+    refined: Refined, residual: float, covariance_m2: Array, axis_deg: float | None
 ) -> MatchOutcome:
     found = Match(
         shift_m=refined.shift_m,
@@ -265,9 +259,6 @@ def _closure(
         residual=residual,
         overlap_cells=refined.overlap_cells,
         axis_deg=axis_deg,
-        false_mass=false_mass,
-        log_evidence=log_evidence,
-        misfit=refined.misfit,
         variance_m2=refined.variance_m2,
         centre_m=refined.centre_m,
         reference_time_s=refined.reference_time_s,

@@ -214,10 +214,7 @@ def test_outcomes_read_back_exactly() -> None:
         residual=0.1,
         overlap_cells=int(np.int64(7)),
         axis_deg=None,
-        false_mass=0.0,
-        log_evidence=np.inf,
-        misfit=1.0,
-        variance_m2=2.0,
+        variance_m2=np.inf,
         centre_m=np.array([5.0, 6.0]),
         reference_time_s=3.0,
         query_time_s=4.0,
@@ -233,7 +230,7 @@ def test_outcomes_read_back_exactly() -> None:
     assert now_s == 0.1 + 0.2
     assert [o.reason for o in read] == [o.reason for o in outcomes]
     assert read[0].match is not None
-    assert read[0].match.log_evidence == np.inf
+    assert read[0].match.variance_m2 == np.inf
     np.testing.assert_array_equal(read[0].match.covariance_m2, found.covariance_m2)
     np.testing.assert_array_equal(read[0].match.shift_m, found.shift_m)
     assert read[-1].hint is not None

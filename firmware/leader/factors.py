@@ -114,35 +114,33 @@ def _closure(record: ClosureRecord, noise: gtsam.noiseModel.Base) -> gtsam.Nonli
 
     Its innovation is linear, but its noise is robust, so that gtsam has no factor of its own.
     """
-    ways = _way(record.origin, record.target)
-    whole = np.hstack(list(ways.values()))
-    at_zero_m = record.innovation_m(lambda key: np.zeros(ways[key].shape[1]))
+    way = _Way(record.origin, record.target)
 
     def error(_this: object, values: gtsam.Values, jacobians: _Jacobians) -> Array:
         if jacobians is not None:
-            for k, way in enumerate(ways.values()):
-                jacobians[k] = way
-        states = np.concatenate([values.atVector(key) for key in ways])
-        return np.asarray(whole @ states + at_zero_m)
+            for k, block in enumerate(way.blocks):
+                jacobians[k] = block
+        return np.asarray(way.moved_m(values) - record.offset_m)
 
-    return _custom(noise, list(ways), error)
+    return _custom(noise, way.keys, error)
 
 
 def _range(record: RangeRecord, noise: gtsam.noiseModel.Base) -> gtsam.NonlinearFactor:
     """Return a factor of a closure's variables, and of a clock where one is estimated."""
-    ways = _way(record.origin, record.target)
-    clocks = [] if record.clock is None else [record.clock]
+    way = _Way(record.origin, record.target)
+    clock = record.clock
 
     def error(_this: object, values: gtsam.Values, jacobians: _Jacobians) -> Array:
-        miss_m, direction = record.innovation_m(values.atVector)
+        clock_state = None if clock is None else values.atVector(clock)
+        miss_m, direction = record.miss_m(way.moved_m(values), clock_state)
         if jacobians is not None:
-            for k, way in enumerate(ways.values()):
-                jacobians[k] = (direction @ way)[None, :]
-            if record.clock is not None:
-                jacobians[len(ways)] = record.by_clock[None, :]
+            for k, block in enumerate(way.blocks):
+                jacobians[k] = (direction @ block)[None, :]
+            if clock is not None:
+                jacobians[len(way.blocks)] = record.by_clock[None, :]
         return np.array([miss_m])
 
-    return _custom(noise, [*ways, *clocks], error)
+    return _custom(noise, way.keys if clock is None else [*way.keys, clock], error)
 
 
 def _absolute(record: AbsoluteRecord, noise: gtsam.noiseModel.Base) -> gtsam.NonlinearFactor:
@@ -156,10 +154,22 @@ def _absolute(record: AbsoluteRecord, noise: gtsam.noiseModel.Base) -> gtsam.Non
     return _custom(noise, [anchor.key, anchor.parameters], error)
 
 
-def _way(origin: Anchor, target: Anchor) -> dict[int, Array]:
-    """Return how the way between two anchors grows with each variable, (2, n) by key."""
-    ways: dict[int, Array] = {}
-    for sign, end in ((-1.0, origin), (1.0, target)):
-        for key, block in ((end.key, end.by_state), (end.parameters, -end.turning)):
-            ways[key] = ways.get(key, 0.0) + sign * block
-    return ways
+class _Way:
+    """The way from one anchor to another, linear in the variables on which it depends.
+
+    blocks (2, n) tell how it grows with each of the keys.
+    """
+
+    def __init__(self, origin: Anchor, target: Anchor) -> None:
+        by_key: dict[int, Array] = {}
+        for sign, end in ((-1.0, origin), (1.0, target)):
+            for key, block in ((end.key, end.by_state), (end.parameters, -end.turning)):
+                by_key[key] = by_key.get(key, 0.0) + sign * block
+        self.keys, self.blocks = list(by_key), list(by_key.values())
+        self._by_all = np.hstack(self.blocks)
+        self._at_zero_m = target.offset_m - origin.offset_m
+
+    def moved_m(self, values: gtsam.Values) -> Array:
+        """Return the way (2,) by an estimate; solvers ask so often that it is one product."""
+        states = np.concatenate([values.atVector(key) for key in self.keys])
+        return np.asarray(self._by_all @ states + self._at_zero_m)

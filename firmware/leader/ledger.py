@@ -4,6 +4,7 @@ Node states are (north, east, bias north, bias east); a vehicle's parameters are
 rad, log scale). Every record computes its own error, in the units of its sigmas.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -171,9 +172,13 @@ class RangeRecord:
     def innovation_m(self, states: States) -> tuple[float, Array]:
         """Return estimated minus measured range, and the unit vector (2,) from origin to target."""
         between_m = position_of(self.target, states) - position_of(self.origin, states)
-        distance_m = float(np.hypot(*between_m))
+        return self.miss_m(between_m, None if self.clock is None else states(self.clock))
+
+    def miss_m(self, between_m: Array, clock: Array | None) -> tuple[float, Array]:
+        """Return the same for the way (2,) from origin to target and the clock's state (2,)."""
+        distance_m = math.hypot(*between_m)
         direction = between_m / distance_m if distance_m > 1e-6 else np.array([1.0, 0.0])
-        late_m = 0.0 if self.clock is None else float(self.by_clock @ states(self.clock))
+        late_m = 0.0 if clock is None else float(self.by_clock @ clock)
         return distance_m + late_m - self.range_m, direction
 
 

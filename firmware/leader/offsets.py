@@ -61,23 +61,23 @@ def offsets_of(sheet: Sheet, others: list[Sheet], estimate: Estimate) -> list[Of
             anchors.append(anchor_of(other, estimate))
             placed.append(other)
     joint = estimate.state_covariance(anchors)
-    own_m, found = correction_of(sheet, estimate), []
-    for k, other in enumerate(placed, start=1):
-        ends = joint[[k, 0]][:, :, [k, 0]].reshape(8, 8)
-        covariance_m2 = _BETWEEN @ ends @ _BETWEEN.T
-        gain = _DRIFTS @ ends @ _BETWEEN.T @ np.linalg.inv(covariance_m2 + _TINY_M2 * np.eye(2))
-        found.append(
-            Offset(
-                origin=other,
-                shift_m=own_m - correction_of(other, estimate),
-                covariance_m2=covariance_m2,
-                drifts=Drifts(
-                    gain=gain,
-                    left=_DRIFTS @ ends @ _DRIFTS.T - gain @ covariance_m2 @ gain.T,
-                ),
-            )
+    ends = np.array([joint[[k, 0]][:, :, [k, 0]] for k in range(1, len(anchors))])
+    ends = ends.reshape(-1, 8, 8)  # of each pair, the other's state first
+    covariances_m2 = _BETWEEN @ ends @ _BETWEEN.T
+    known = np.linalg.inv(covariances_m2 + _TINY_M2 * np.eye(2))
+    gains = _DRIFTS @ ends @ _BETWEEN.T @ known
+    told = gains @ covariances_m2 @ gains.swapaxes(1, 2)
+    left = _DRIFTS @ ends @ _DRIFTS.T - told
+    moves_m = corrections([sheet, *placed], estimate)
+    return [
+        Offset(
+            origin=other,
+            shift_m=moves_m[0] - moves_m[k],
+            covariance_m2=covariances_m2[k - 1],
+            drifts=Drifts(gain=gains[k - 1], left=left[k - 1]),
         )
-    return found
+        for k, other in enumerate(placed, start=1)
+    ]
 
 
 def anchor_of(sheet: Sheet, estimate: Estimate) -> Anchor:

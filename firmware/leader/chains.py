@@ -2,6 +2,7 @@
 
 import bisect
 import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,8 +23,9 @@ class Chain:
 
     There is no clock where none is estimated.
 
-    `shape` is the trajectory as it was last estimated where only some nodes are left. `lost` are
-    the spans, first and last second, in which the vehicle's motion is unknown.
+    `shape` is the trajectory as it was last estimated where only some nodes are left; apart_m2
+    (S, 2, 2) are the covariances of the ways from its positions to the nodes nearest to them.
+    `lost` are the spans, first and last second, in which the vehicle's motion is unknown.
     """
 
     number: int
@@ -34,6 +36,7 @@ class Chain:
     keys: list[int] = field(default_factory=list)
     added: int = 0
     shape: Trajectory | None = None
+    apart_m2: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))
     lost: list[tuple[float, float]] = field(default_factory=list)
 
     def lose(self, begin_s: float, end_s: float) -> None:
@@ -69,12 +72,17 @@ class Chain:
         return _nearest(self.times_s, time_s)
 
     def in_shape_s(self, time_s: float) -> float:
-        """Return the time of the shape's node that is nearest to a time."""
+        """Return the time of the shape's position that is nearest to a time."""
         assert self.shape is not None
-        times_s = self.shape.time_s
-        after = int(np.searchsorted(times_s, time_s))
-        near_s = times_s[max(after - 1, 0) : after + 1]
-        return float(near_s[np.argmin(np.abs(near_s - time_s))])
+        return float(self.shape.time_s[_nearest(self.shape.time_s, time_s)])
+
+    def apart_at_m2(self, time_s: float) -> Array:
+        """Return the covariance (2, 2) of the way from the shape's position at a time to its node.
+
+        It is that of the nearest of its positions.
+        """
+        assert self.shape is not None
+        return np.asarray(self.apart_m2[_nearest(self.shape.time_s, time_s)])
 
     def trajectory(self, states: Array) -> Trajectory:
         """Return the estimate at all nodes ever, from the states (K, 4) of those that are left."""
@@ -96,8 +104,18 @@ class Chain:
             for k in np.flatnonzero(~kept)
         }
 
-    def drop(self, kept: NDArray[np.bool_], trajectory: Trajectory) -> None:
-        """Leave some nodes (K,) only; what lies between keeps the shape of the trajectory."""
+    def drop(
+        self, kept: NDArray[np.bool_], trajectory: Trajectory, apart_m2: Mapping[int, Array]
+    ) -> None:
+        """Leave some nodes (K,) only; what lies between keeps the shape of the trajectory.
+
+        apart_m2 has, by the key of each node that goes, the covariance (2, 2) of the way to the
+        one nearest to it that stays.
+        """
+        went = [self.keys[self.nearest(time_s)] for time_s in trajectory.time_s]
+        whole_m2 = np.array([apart_m2.get(key, np.zeros((2, 2))) for key in went])
+        whole_m2[: len(self.apart_m2)] += self.apart_m2
+        self.apart_m2 = whole_m2
         stay = np.flatnonzero(kept)
         self.times_s = [self.times_s[k] for k in stay]
         self.reckoned_m = [self.reckoned_m[k] for k in stay]
@@ -122,7 +140,8 @@ class Chain:
         )
 
 
-def _nearest(times_s: list[float], time_s: float) -> int:
+def _nearest(times_s: Sequence[float] | Array, time_s: float) -> int:
+    """Return the index of the time nearest to another, the earlier of two."""
     after = bisect.bisect_left(times_s, time_s)
     if after in (0, len(times_s)):
         return max(after - 1, 0)

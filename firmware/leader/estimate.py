@@ -288,7 +288,10 @@ class Estimate:
             first = 4 * len(keys) + 2 * parameters.index(anchor.parameters)
             row[_POSITION, first : first + 2] = -anchor.turning
         by_all = rows.reshape(-1, len(joint))
-        return np.asarray(by_all @ joint @ by_all.T)
+        covariance = by_all @ joint @ by_all.T
+        for k, anchor in enumerate(anchors, start=len(nodes)):
+            covariance[4 * k : 4 * k + 2, 4 * k : 4 * k + 2] += anchor.apart_m2
+        return np.asarray(covariance)
 
     def _joint_covariance(
         self, keys: list[int], part: slice = _POSITION, *, reckoned: bool = False
@@ -300,10 +303,16 @@ class Estimate:
         return np.asarray(joint[np.ix_(rows, rows)])
 
     def _anchor_in_shape(self, vehicle: int, key: int, time_s: float, track: Track) -> Anchor:
+        chain = self._chains[vehicle]
         here_m = self.trajectory(vehicle).correct(time_s, track.position_at(time_s))
-        moved_m, parameters = here_m - self._state(key)[:2], self._chains[vehicle].parameters
-        offset_m = as_reckoned(moved_m, self._state(parameters))
-        return Anchor(key=key, parameters=parameters, offset_m=offset_m, time_s=time_s)
+        moved_m = here_m - self._state(key)[:2]
+        return Anchor(
+            key=key,
+            parameters=chain.parameters,
+            offset_m=as_reckoned(moved_m, self._state(chain.parameters)),
+            time_s=time_s,
+            apart_m2=chain.apart_at_m2(time_s),
+        )
 
     def _forget_solution(self) -> None:
         self._trajectories.clear()

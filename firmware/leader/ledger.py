@@ -23,6 +23,7 @@ class Anchor:
     The offset drifts with the node's bias for lag_s. The lever leads from the position to a place
     that the sonar saw. Both are told in the frame of the vehicle's own compass, and turn with its
     heading bias; the offset, which the log measured, stretches with its scale as well.
+    apart_m2 (2, 2) is the covariance of the offset, where it was estimated once and for all.
     """
 
     key: int
@@ -31,6 +32,7 @@ class Anchor:
     time_s: float
     lag_s: float = 0.0
     lever_m: Array = field(default_factory=lambda: np.zeros(2))  # (2,)
+    apart_m2: Array = field(default_factory=lambda: np.zeros((2, 2)))
 
     @property
     def by_state(self) -> Array:

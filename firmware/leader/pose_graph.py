@@ -132,12 +132,12 @@ class PoseGraph(Estimate):
         self, origin: Anchor, target: Anchor, offset_m: Array, covariance_m2: Array, *, active: bool
     ) -> int:
         """Enter a closure, target minus origin (2,) in metres, and return its number."""
-        floor_m2 = self._settings.closure_floor_m**2
+        floor_m2 = self._settings.closure_floor_m**2 * np.eye(2)
         record = ClosureRecord(
             origin=origin,
             target=target,
             offset_m=offset_m,
-            covariance_m2=covariance_m2 + floor_m2 * np.eye(2),
+            covariance_m2=covariance_m2 + floor_m2 + origin.apart_m2 + target.apart_m2,
         )
         return self._enter(record, active=active)
 
@@ -211,7 +211,7 @@ class PoseGraph(Estimate):
         shapes = {vehicle: self.trajectory(vehicle).until(detail_s) for vehicle in self._chains}
         self._walk = walk
         for vehicle, chain in self._chains.items():
-            chain.drop(kept[vehicle], shapes[vehicle])
+            chain.drop(kept[vehicle], shapes[vehicle], apart_m2)
         old = {
             key
             for chain in self._chains.values()

@@ -7,7 +7,7 @@ from typing import TypeVar
 import numpy as np
 import pytest
 
-from firmware.geometry import Array
+from firmware.geometry import Array, offset_covariance
 from firmware.leader.chains import Chain
 from firmware.leader.composition import Composition, CompositionSettings, kept_nodes
 from firmware.leader.graph_settings import GraphSettings
@@ -184,6 +184,19 @@ def test_rough_range_takes_nothing_from_the_sharp_ones_beside_it() -> None:
     ]
     assert composed.sigma_m < 1.5
     assert abs(composed.innovation_m(graph._state)[0]) < 1.5
+
+
+def test_way_between_dropped_nodes_is_no_surer_than_before(whole: Voyage, coarse: Voyage) -> None:
+    """Both may hang on the same node that is left: the way between them is not known exactly."""
+    pairs_s = ((613.0, 703.0), (613.0, 1205.0), (905.0, 1999.0))
+    for ends_s in pairs_s:
+        sigmas_m = []
+        for voyage in (whole, coarse):
+            track = voyage.tracks[0][0]
+            ends = [voyage.graph.anchor(0, time_s, track) for time_s in ends_s]
+            apart_m2 = offset_covariance(voyage.graph.covariance(ends))
+            sigmas_m.append(float(np.sqrt(np.linalg.eigvalsh(apart_m2)[-1])))
+        assert 0.9 * sigmas_m[0] < sigmas_m[1] < 4.0 * sigmas_m[0]
 
 
 def test_anchor_in_the_composed_past_lies_on_the_estimated_track() -> None:

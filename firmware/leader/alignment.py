@@ -57,6 +57,11 @@ class Aligned:
     spans: tuple[Span, Span]  # of reference and query
     basis: Array  # (6, R, C) offset, tilt, bend
 
+    @property
+    def extent_m(self) -> float:
+        """How far the overlap's cells lie from its middle, root mean square."""
+        return float(np.sqrt(np.sum(self.basis[1:3] ** 2) / self.both.sum()))
+
 
 def fields_of(layer: Layer, smoothing_cells: float) -> Array:
     """Return depth, variance, time and smoothed slopes to north and east, (5, R, C).

@@ -32,7 +32,8 @@ _UNSTRAINED_MISFIT = 0.8  # what the noise model alone leaves at the best shift,
 LEAST_MISFIT = 0.5  # noise is seldom less than half of what is assumed
 _LEAST_RIDGE = 5  # shifts that fit; fewer have no direction
 _RIDGE_SIGMA_RAD = 0.01  # of its direction: half a degree of heading between two passes
-_PRIOR_DOUBTED = 3.0  # sigmas of it, where a ridge's direction still has to hold
+UNTRACED_RAD = 0.03  # sigma of an axis that no ridge was followed for
+PRIOR_DOUBTED = 3.0  # sigmas of it, where a ridge's direction still has to hold
 _LEAST_GAIN = 0.3  # f(1) of a background of 2.3; below it the surface hardly has a minimum
 
 
@@ -185,19 +186,25 @@ def posterior(surface: ErrorSurface, evidence: Array, prior: Prior, null_share: 
 
 
 def ridge_of(
-    surface: ErrorSurface, limit: float, prior: Prior, winner_m: Array, axis: Array
+    surface: ErrorSurface,
+    limit: float,
+    prior: Prior,
+    winner_m: Array,
+    axis: Array,
+    turned_rad: float = 0.0,
 ) -> Ridge:
     """Return the line along which shifts keep fitting from the winner, roughly across the axis.
 
     Of the shifts side by side across the line, the best belongs to the ridge if its misfit is
     within the limit. The line is fitted to as much of the ridge as a prior three times as wide
     allows, since its direction has to hold where the prior is wrong; how far the ridge strays from
-    the line is weighted by the prior itself.
+    the line is weighted by the prior itself. turned_rad is the sigma of how far what is not known
+    of drift turns the one sub-map against the other.
     """
     misfit = surface.residual_m2 / surface.noise_m2
     row, column = np.nonzero(np.isfinite(misfit) & (misfit <= limit))
     if row.size < _LEAST_RIDGE:
-        return Ridge(axis=axis, sigma_rad=_RIDGE_SIGMA_RAD, strayed_m2=0.0)
+        return Ridge(axis=axis, sigma_rad=math.hypot(UNTRACED_RAD, turned_rad), strayed_m2=0.0)
     cell_m = float(surface.north_m[1] - surface.north_m[0])
     shifts_m = np.stack([surface.north_m[row], surface.east_m[column]])
     from_winner_m = shifts_m - winner_m[:, None]
@@ -209,7 +216,7 @@ def ridge_of(
     square = np.sum(away_m * np.linalg.solve(prior.covariance_m2, away_m), axis=0)
     square -= square.min()
     along, across = line @ from_winner_m[:, ridge], axis @ from_winner_m[:, ridge]
-    wide = np.exp(-0.5 * square / _PRIOR_DOUBTED**2)
+    wide = np.exp(-0.5 * square / PRIOR_DOUBTED**2)
     spread_m2 = float(wide @ along**2)
     tilt = float(wide @ (along * across)) / max(spread_m2, cell_m**2)
     off_m = across - tilt * along
@@ -218,7 +225,7 @@ def ridge_of(
     strayed = float(np.average(off_m**2, weights=np.exp(-0.5 * square)))
     return Ridge(
         axis=turned / np.hypot(*turned),
-        sigma_rad=float(np.hypot(sigma_rad, _RIDGE_SIGMA_RAD)),
+        sigma_rad=math.hypot(sigma_rad, turned_rad, _RIDGE_SIGMA_RAD),
         strayed_m2=max(strayed - cell_m**2 / 6.0, 0.0),  # which the lattice itself makes
     )
 

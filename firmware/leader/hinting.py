@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from firmware.geometry import Array
 from firmware.leader import ambiguity
@@ -15,10 +16,11 @@ _WARPED_NOISE = 0.35  # of the cells' variance: taking drift out of a grid avera
 _TOLERANCE = 1.2  # of the best misfit: a hint tells a region of shifts, not one
 _NOTHING_GAINED = 0.95  # share of the prior's variance left: that axis is as unknown as before
 _LONGEST_SIGMAS = np.pi  # of the prior: the longest wave that tells its shifts apart
-_PROFILE_SIGMAS = 0.25  # of a region, between shifts whose misfits are held side by side
-_MOST_BINS = 160  # of a profile: forty sigmas of the region
+_PROFILE_SIGMAS = 0.25  # of a region, between shifts that are held side by side
+_MOST_BINS = 160  # of a profile, however far it reaches
 _LEAST_SHARE = 1e-6  # of the prior's variance that a region has left, for its own scale
-_CONTRADICTION = 2.0  # nats of misfit that end a region
+_CONTRADICTION = 2.0  # nats of misfit that end a region, where it is
+_UNLIKE = 0.1  # of the misfit of unrelated seabed: drift makes so much of the relief itself
 _NO_INFORMATION = 1e4  # variances of the prior
 
 
@@ -36,10 +38,10 @@ def hint_of(
     root = np.linalg.cholesky(prior.covariance_m2)
     inverse = np.linalg.inv(root)
     left, axes = np.linalg.eigh(inverse @ covariance_m2 @ inverse.T)  # shares of the prior
-    misfit = ambiguity.misfit_of(surface, cautious.noise_scale, problem.correlated_cells)
+    contradicted = _contradicted(problem, surface, cautious)
     sigmas = np.sqrt(np.maximum(left, _LEAST_SHARE))
     away = axes.T @ inverse @ _shifts_from(surface, mean_m) / sigmas[:, None]
-    closed = np.array([_is_closed(away[k], away[1 - k], misfit.ravel()) for k in (0, 1)])
+    closed = np.array([_is_closed(away[k], away[1 - k], contradicted) for k in (0, 1)])
     gained = closed & (left < _NOTHING_GAINED)
     if not gained.any() or left[gained].min() > settings.hint_gain:
         return None
@@ -48,6 +50,10 @@ def hint_of(
     steps = np.where(gained, moved / np.maximum(1.0 - left, 1e-3), 0.0)
     frame = root @ axes
     told = np.where(gained, settings.hint_scale * share, _NO_INFORMATION)
+    if not gained.all():  # an axis a little askew would tell of what slides along
+        (k,) = np.flatnonzero(gained)
+        slide_m = ambiguity.PRIOR_DOUBTED * np.hypot(*frame[:, 1 - k])
+        told[k] += (ambiguity.UNTRACED_RAD * slide_m * np.hypot(*(inverse.T @ axes[:, k]))) ** 2
     return Hint(
         shift_m=prior.mean_m + frame @ steps,
         covariance_m2=frame @ np.diag(told) @ frame.T + settings.hint_floor_m**2 * np.eye(2),
@@ -55,29 +61,41 @@ def hint_of(
 
 
 def _shifts_from(surface: ErrorSurface, mean_m: Array) -> Array:
-    """Return all shifts of a surface (2, K L) from a mean."""
-    north, east = np.meshgrid(
-        surface.north_m - mean_m[0], surface.east_m - mean_m[1], indexing="ij"
-    )
-    return np.stack([north.ravel(), east.ravel()])
+    """Return the shifts (2, S) of a surface at which there is overlap, from a mean."""
+    row, column = np.nonzero(np.isfinite(surface.residual_m2))
+    return np.stack([surface.north_m[row], surface.east_m[column]]) - mean_m[:, None]
 
 
-def _is_closed(along: Array, across: Array, misfit: Array) -> bool:
-    """Return whether misfit ends the region of likely shifts on both its sides along an axis.
+def _contradicted(problem: PairProblem, surface: ErrorSurface, relief: Relief) -> NDArray[np.bool_]:
+    """Return at which shifts (K L,) that overlap the two sub-maps contradict each other.
 
-    along and across (K,) are in sigmas of the region. Where it goes on as far as the sub-maps
-    overlap, as along a ridge or a straight slope, it may go on beyond as well: that they overlap
-    at all is then no more than a guess.
+    Misfit grows with the overlap wherever drift bends what is compared: it has to be a good part
+    of what unrelated seabed shows as well, lest it end a ridge that goes on.
     """
-    band = (np.abs(across) <= 1.0) & np.isfinite(misfit)
-    for side in (along[band], -along[band]):
-        ahead = side > 0.0
-        if not ahead.any():
-            return False
-        bins = np.minimum(side[ahead] / _PROFILE_SIGMAS, _MOST_BINS - 1).astype(np.intp)
-        least = np.full(_MOST_BINS, np.inf)
-        np.minimum.at(least, bins, misfit[band][ahead])
-        if not np.any(least[np.isfinite(least)] >= _CONTRADICTION):
+    error = surface.residual_m2 / surface.noise_m2
+    least = float(error.min())
+    unlike = least + _UNLIKE * max(relief.background - least, 0.0)
+    misfit = ambiguity.misfit_of(surface, relief.noise_scale, problem.correlated_cells)
+    return np.asarray((misfit >= _CONTRADICTION) & (error >= unlike))[np.isfinite(misfit)]
+
+
+def _is_closed(along: Array, across: Array, contradicted: NDArray[np.bool_]) -> bool:
+    """Return whether the region of likely shifts ends on both its sides along an axis.
+
+    along and across (S,) are in sigmas of the region; it ends where all shifts abreast are
+    contradicted (S,). Where it goes on as far as the sub-maps overlap, as along a ridge or a
+    straight slope, it may go on beyond as well: that they overlap at all is then no more than a
+    guess.
+    """
+    band = np.abs(across) <= 1.0
+    for side in (along, -along):
+        ahead = band & (side > 0.0)
+        step = max(_PROFILE_SIGMAS, float(side.max()) / (_MOST_BINS - 1))
+        bins = (side / step).astype(np.intp)
+        ended, going_on = np.zeros((2, _MOST_BINS), dtype=bool)
+        ended[bins[ahead & contradicted]] = True
+        going_on[bins[ahead & ~contradicted]] = True
+        if not np.any(ended & ~going_on):
             return False
     return True
 

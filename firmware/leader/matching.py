@@ -19,7 +19,6 @@ from firmware.submaps import GriddedSubmap
 from protocol.errors import EstimationError
 
 _FREE_M = 1e4  # of a one-axis closure across it: nothing, however often it is said
-_DOUBTED = 3.0  # sigmas of the prior by which a one-axis closure may have to slide
 _NEGLIGIBLE = 1e-6  # mass beside the best lattice shift's that is not worth refining
 
 
@@ -239,9 +238,10 @@ def _decide(
         axis = np.array([np.cos(elsewhere.axis_rad), np.sin(elsewhere.axis_rad)])
     else:
         return _none(NoMatch.AMBIGUOUS)
-    line = ambiguity.ridge_of(*ridge, prior, refined.shift_m, axis)
+    turned_rad = settings.strain_sigma_m / winner.field.extent_m
+    line = ambiguity.ridge_of(*ridge, prior, refined.shift_m, axis, turned_rad)
     axis, across = line.axis, np.array([-line.axis[1], line.axis[0]])
-    slide_m2 = _DOUBTED**2 * float(across @ prior.covariance_m2 @ across)
+    slide_m2 = ambiguity.PRIOR_DOUBTED**2 * float(across @ prior.covariance_m2 @ across)
     along = float(axis @ covariance @ axis) + line.strayed_m2 + line.sigma_rad**2 * slide_m2
     if along > settings.sigma_limit_m**2:
         return _none(NoMatch.LOOSE)

@@ -1,7 +1,8 @@
 """Absolute positions: GNSS at the surface, USBL from a ship or about a follower. Judged, then used.
 
 A fix waits until its vehicle's dead reckoning is known at its time. It is gated by the estimate's
-own covariance: an impossible one is counted and dropped.
+own covariance: an impossible one is counted and dropped, and so is one right after another unless
+it is much surer.
 """
 
 from collections import Counter, deque
@@ -29,6 +30,12 @@ class FixSettings(Settings):
     sigma_limit_m: float = setting(
         1e4, "m", "a fix that is worse says nothing of a survey", minimum=1.0
     )
+    apart_s: float = setting(
+        60.0,
+        "s",
+        "what is wrong with a fix lasts for minutes: more of them tell no more",
+        minimum=0.0,
+    )
     held: int = setting(64, "fixes", "of vehicles whose track is late; the oldest go", minimum=1)
     longest_wait_s: float = setting(900.0, "s", "as long as a follower keeps a frame", minimum=10.0)
 
@@ -40,6 +47,7 @@ class Fixes:
         self.counters: Counter[str] = Counter()
         self._settings = settings
         self._held: deque[tuple[float, Fix]] = deque(maxlen=settings.held)
+        self._used: dict[int, tuple[float, float]] = {}  # time and sigma of each chain's last
 
     def hold(self, time_s: float, fix: Fix) -> None:
         """Keep a fix until it can be used."""
@@ -68,6 +76,9 @@ class Fixes:
 
     def _entered(self, time_s: float, fix: Fix, fleet: Fleet, graph: PoseGraph) -> str:
         chain = fleet.chain_at(fix.vehicle, time_s)
+        last_s, last_sigma_m = self._used.get(chain, (-np.inf, np.inf))
+        if abs(time_s - last_s) < self._settings.apart_s and fix.sigma_m > last_sigma_m / 2.0:
+            return "fixes_alike"
         fleet.extend(chain)
         anchor = graph.anchor(chain, time_s, fleet.track(chain))
         variance_m2 = fix.sigma_m**2 + self._settings.sigma_floor_m**2
@@ -78,4 +89,5 @@ class Fixes:
             return "fixes_rejected"
         graph.add_absolute(anchor, position_m, variance_m2 * np.eye(2))
         graph.update()
+        self._used[chain] = time_s, fix.sigma_m
         return "fixes_used"

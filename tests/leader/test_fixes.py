@@ -26,17 +26,19 @@ def sailed(seconds: int, fix: Fix | None = None) -> LeaderCore:
     return leader
 
 
-def tell(leader: LeaderCore, fix: Fix, at_s: float) -> None:
-    leader.receive_odometry(
-        Odometry(
-            time_s=at_s,
-            velocity_north_mps=2.0,
-            velocity_east_mps=0.0,
-            yaw_rad=0.0,
-            depth_m=10.0,
-            fix=fix,
-        )
+def sample(at_s: float, fix: Fix) -> Odometry:
+    return Odometry(
+        time_s=at_s,
+        velocity_north_mps=2.0,
+        velocity_east_mps=0.0,
+        yaw_rad=0.0,
+        depth_m=10.0,
+        fix=fix,
     )
+
+
+def tell(leader: LeaderCore, fix: Fix, at_s: float) -> None:
+    leader.receive_odometry(sample(at_s, fix))
     sail(leader, line(0.0, 0.0), at_s + 1.75, sonar_on=False)
     leader.tick(at_s + 1.75)
 
@@ -52,6 +54,20 @@ def test_fix_that_the_estimate_finds_impossible_is_counted_and_dropped() -> None
     leader = sailed(60, Fix(north_m=5000.0, east_m=0.0, sigma_m=2.0))
     assert leader.status()["fixes_rejected"] == 1
     assert leader.belief().position_m[0] == pytest.approx(123.5, abs=3.0)
+
+
+def test_fixes_in_quick_succession_tell_no_more_than_one() -> None:
+    leader = sailed(600)
+    for second in range(1, 51):  # all of them 3 m off
+        fix = Fix(north_m=1203.5 + 2.0 * second, east_m=0.0, sigma_m=3.0)
+        leader.receive_odometry(sample(600.25 + second, fix))
+        leader.tick(600.25 + second)
+    status, belief = leader.status(), leader.belief()
+    assert (status["fixes_used"], status["fixes_alike"]) == (1, 49)
+    assert belief.covariance_m2[0, 0] > 2.0**2
+    surer = Fix(north_m=belief.position_m[0], east_m=0.0, sigma_m=1.0)
+    tell(leader, surer, 650.5)
+    assert leader.status()["fixes_used"] == 2
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ _UNSTRAINED_MISFIT = 0.8  # what the noise model alone leaves at the best shift,
 LEAST_MISFIT = 0.5  # noise is seldom less than half of what is assumed
 _LEAST_RIDGE = 5  # shifts that fit; fewer have no direction
 _RIDGE_SIGMA_RAD = 0.01  # of its direction: half a degree of heading between two passes
-UNTRACED_RAD = 0.03  # sigma of an axis that no ridge was followed for
+_UNTRACED_RAD = 0.3  # where too few shifts fit to follow it: slopes at the winner tell little
 PRIOR_DOUBTED = 3.0  # sigmas of it, where a ridge's direction still has to hold
 _LEAST_GAIN = 0.3  # f(1) of a background of 2.3; below it the surface hardly has a minimum
 
@@ -204,7 +204,7 @@ def ridge_of(
     misfit = surface.residual_m2 / surface.noise_m2
     row, column = np.nonzero(np.isfinite(misfit) & (misfit <= limit))
     if row.size < _LEAST_RIDGE:
-        return Ridge(axis=axis, sigma_rad=math.hypot(UNTRACED_RAD, turned_rad), strayed_m2=0.0)
+        return Ridge(axis=axis, sigma_rad=math.hypot(_UNTRACED_RAD, turned_rad), strayed_m2=0.0)
     cell_m = float(surface.north_m[1] - surface.north_m[0])
     shifts_m = np.stack([surface.north_m[row], surface.east_m[column]])
     from_winner_m = shifts_m - winner_m[:, None]

@@ -20,6 +20,7 @@ _PROFILE_SIGMAS = 0.25  # of a region, between shifts that are held side by side
 _MOST_BINS = 160  # of a profile, however far it reaches
 _LEAST_SHARE = 1e-6  # of the prior's variance that a region has left, for its own scale
 _CONTRADICTION = 2.0  # nats of misfit that end a region, where it is
+_ASKEW_RAD = 0.03  # sigma of the axis of a hint along one only
 _UNLIKE = 0.1  # of the misfit of unrelated seabed: drift makes so much of the relief itself
 _NO_INFORMATION = 1e4  # variances of the prior
 
@@ -53,7 +54,7 @@ def hint_of(
     if not gained.all():  # an axis a little askew would tell of what slides along
         (k,) = np.flatnonzero(gained)
         slide_m = ambiguity.PRIOR_DOUBTED * np.hypot(*frame[:, 1 - k])
-        told[k] += (ambiguity.UNTRACED_RAD * slide_m * np.hypot(*(inverse.T @ axes[:, k]))) ** 2
+        told[k] += (_ASKEW_RAD * slide_m * np.hypot(*(inverse.T @ axes[:, k]))) ** 2
     return Hint(
         shift_m=prior.mean_m + frame @ steps,
         covariance_m2=frame @ np.diag(told) @ frame.T + settings.hint_floor_m**2 * np.eye(2),

@@ -96,7 +96,7 @@ class LeaderCore:
         self.composed_s = start.time_s
         self._turns = Turns(slots, LEADER, start.time_s)
         start_m = np.array([start.north_m, start.east_m])
-        self.graph.add_vehicle(LEADER, start.time_s, start_m, start_m)
+        self.graph.add_chain(LEADER, start.time_s, start_m, start_m)
 
     # what comes in
 

@@ -32,7 +32,10 @@ _APART_AT_ONCE = 64  # nodes of a chain beside each other: fewer ask more often,
 
 
 class Estimate:
-    """Every vehicle's trajectory, as the ledger has it."""
+    """Every vehicle's trajectory, as the ledger has it.
+
+    Each boot of a vehicle has a chain of nodes of its own, known by an id (`atlas.chain_of`).
+    """
 
     def __init__(self, settings: GraphSettings) -> None:
         self._settings = settings
@@ -64,8 +67,8 @@ class Estimate:
         apart = self._settings.walk_apart * self._walk
         return Wandering(noise=self._settings.odometry_noise, walk=self._walk, apart=apart)
 
-    def vehicles(self) -> list[int]:
-        """Return the vehicles that have a chain."""
+    def chains(self) -> list[int]:
+        """Return the ids of all chains."""
         return list(self._chains)
 
     def update(self) -> None:
@@ -79,25 +82,25 @@ class Estimate:
         self._solver.solve_batch()
         self._forget_solution()
 
-    def anchor(self, vehicle: int, time_s: float, track: Track) -> Anchor:
+    def anchor(self, chain_id: int, time_s: float, track: Track) -> Anchor:
         """Return the node nearest in time, and the offset from it to the position at the time.
 
-        Raises EstimationError if the vehicle has no node within two intervals of the time.
+        Raises EstimationError if the chain has no node within two intervals of the time.
         """
-        if vehicle not in self._chains:
-            raise EstimationError(f"vehicle {vehicle} has no chain in the graph")
-        chain = self._chains[vehicle]
+        if chain_id not in self._chains:
+            raise EstimationError(f"there is no chain {chain_id} in the graph")
+        chain = self._chains[chain_id]
         nearest = chain.nearest(time_s)
         key, lag_s = chain.keys[nearest], time_s - chain.times_s[nearest]
         in_shape = chain.shape is not None and time_s < chain.shape.time_s[-1]
         known_s = chain.in_shape_s(time_s) if in_shape else chain.times_s[nearest]
         if abs(time_s - known_s) > 2 * self._settings.node_interval_s:
             raise EstimationError(
-                f"vehicle {vehicle} has no node near {time_s:.1f} s; the nearest is at"
+                f"chain {chain_id} has no node near {time_s:.1f} s; the nearest is at"
                 f" {known_s:.1f} s"
             )
         if in_shape:
-            return self._anchor_in_shape(vehicle, key, time_s, track)
+            return self._anchor_in_shape(chain_id, key, time_s, track)
         return Anchor(
             key=key,
             parameters=chain.parameters,
@@ -106,24 +109,24 @@ class Estimate:
             lag_s=lag_s,
         )
 
-    def trajectory(self, vehicle: int) -> Trajectory:
-        """Return the estimate of one vehicle at all of its nodes."""
-        if vehicle not in self._trajectories:
-            chain = self._chains[vehicle]
+    def trajectory(self, chain_id: int) -> Trajectory:
+        """Return the estimate of one chain at all of its nodes."""
+        if chain_id not in self._trajectories:
+            chain = self._chains[chain_id]
             states = np.array([self._state(key) for key in chain.keys])
-            self._trajectories[vehicle] = chain.trajectory(states)
-        return self._trajectories[vehicle]
+            self._trajectories[chain_id] = chain.trajectory(states)
+        return self._trajectories[chain_id]
 
-    def parameters(self, vehicle: int) -> Array:
+    def parameters(self, chain_id: int) -> Array:
         """Return a vehicle's heading bias in rad and log scale, (2,)."""
-        return self._state(self._chains[vehicle].parameters)
+        return self._state(self._chains[chain_id].parameters)
 
-    def clock(self, vehicle: int, time_s: float) -> tuple[float, float]:
+    def clock(self, chain_id: int, time_s: float) -> tuple[float, float]:
         """Return by how much a vehicle's clock lengthens a range sent at the time, and the sigma.
 
         Both are in m, and zero where no clock is estimated.
         """
-        key = self._chains[vehicle].clock
+        key = self._chains[chain_id].clock
         if key is None:
             return 0.0, 0.0
         self.update()
@@ -188,12 +191,12 @@ class Estimate:
         """
         return self._anchored_covariance([], anchors).reshape(len(anchors), 4, len(anchors), 4)
 
-    def predicted_covariance(self, vehicle: int, time_s: float) -> Array:
+    def predicted_covariance(self, chain_id: int, time_s: float) -> Array:
         """Return the covariance (2, 2) in m^2 of a vehicle's position, from the last node before.
 
         That is its newest one, unless its clock was set back.
         """
-        chain, s = self._chains[vehicle], self._settings
+        chain, s = self._chains[chain_id], self._settings
         node = chain.before(time_s)
         key, node_s = chain.keys[node], chain.times_s[node]
         if key not in self._covariances:
@@ -206,22 +209,22 @@ class Estimate:
         covariance = self._covariances[key]
         return np.asarray(carry @ covariance @ carry.T + grown_m2 * np.eye(2))
 
-    def newest_covariance(self, vehicles: list[int], *, reckoned: bool) -> Array:
-        """Return the joint covariance (4V, 4V) of vehicles' newest states.
+    def newest_covariance(self, chain_ids: list[int], *, reckoned: bool) -> Array:
+        """Return the joint covariance (4V, 4V) of chains' newest states.
 
         `reckoned` leaves out closures, ranges and fixes: what dead reckoning alone would know.
         Raises EstimationError if the information matrix is singular.
         """
         self.update()
-        keys = [self._chains[vehicle].keys[-1] for vehicle in vehicles]
+        keys = [self._chains[chain_id].keys[-1] for chain_id in chain_ids]
         return self._solver.covariance(keys, reckoned=reckoned)
 
-    def newest_with(self, vehicles: list[int], anchors: list[Anchor]) -> Array:
-        """Return the joint covariance of vehicles' newest states and of anchors' positions.
+    def newest_with(self, chain_ids: list[int], anchors: list[Anchor]) -> Array:
+        """Return the joint covariance of chains' newest states and of anchors' positions.
 
         It is (4V + 2A, 4V + 2A). Raises EstimationError if the information matrix is singular.
         """
-        newest = [self._chains[vehicle].keys[-1] for vehicle in vehicles]
+        newest = [self._chains[chain_id].keys[-1] for chain_id in chain_ids]
         joint = self._anchored_covariance(newest, anchors)
         states = 4 * len(newest)
         positions = states + (4 * np.arange(len(anchors))[:, None] + [0, 1]).ravel()
@@ -302,9 +305,9 @@ class Estimate:
         rows = (4 * np.arange(len(keys))[:, None] + np.arange(4)[part]).ravel()
         return np.asarray(joint[np.ix_(rows, rows)])
 
-    def _anchor_in_shape(self, vehicle: int, key: int, time_s: float, track: Track) -> Anchor:
-        chain = self._chains[vehicle]
-        here_m = self.trajectory(vehicle).correct(time_s, track.position_at(time_s))
+    def _anchor_in_shape(self, chain_id: int, key: int, time_s: float, track: Track) -> Anchor:
+        chain = self._chains[chain_id]
+        here_m = self.trajectory(chain_id).correct(time_s, track.position_at(time_s))
         moved_m = here_m - self._state(key)[:2]
         return Anchor(
             key=key,

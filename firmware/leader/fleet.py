@@ -74,7 +74,7 @@ class Fleet:
 
     def vehicles(self) -> list[int]:
         """Return the vehicles that have a chain, the leader first."""
-        return sorted({vehicle_of(chain) for chain in self._graph.vehicles()})
+        return sorted({vehicle_of(chain) for chain in self._graph.chains()})
 
     def boot_of(self, header: Header) -> int:
         """Return the boot of a frame; a late frame's may be earlier than the newest."""
@@ -124,14 +124,14 @@ class Fleet:
             return
         track = buffer.track()
         self._graph.extend(LEADER, self.own.track())
-        if chain not in self._graph.vehicles():
+        if chain not in self._graph.chains():
             self._begin(chain, track)
         self._graph.extend(chain, track)
         self._graph.update()
 
     def use_ranges(self, chain: int) -> None:
         """Use the held ranges whose senders' states are known by now."""
-        if chain in self._graph.vehicles() and len(self.own):
+        if chain in self._graph.chains() and len(self.own):
             self._ranging.use(chain, self.track(chain), LEADER, self.own.track(), self._graph)
 
     def settle(self, before_s: float) -> None:
@@ -177,7 +177,7 @@ class Fleet:
         return self._chains(vehicle)[-1]
 
     def _chains(self, vehicle: int) -> list[int]:
-        chains = [c for c in self._graph.vehicles() if vehicle_of(c) == vehicle]
+        chains = [c for c in self._graph.chains() if vehicle_of(c) == vehicle]
         return sorted(chains, key=lambda chain: float(self.track(chain).time_s[0]))
 
     def _place(
@@ -222,7 +222,7 @@ class Fleet:
         chains = self._chains(vehicle_of(chain))
         earlier = [c for c in chains if self.track(c).time_s[0] < time_s]
         if not earlier:
-            self._graph.add_vehicle(chain, time_s, start_m, start_m)
+            self._graph.add_chain(chain, time_s, start_m, start_m)
             return
         before, old = earlier[-1], self.track(earlier[-1])
         self._graph.extend(before, old)
@@ -238,7 +238,7 @@ class Fleet:
             moved_m, sigma_m = on_m, 5.0 + float(np.hypot(*on_m))
         elif goes_on and np.hypot(*on_m) > _HELD_M:
             moved_m, sigma_m = on_m - trajectory.bias_at(last_s) * gap_s, 1.0 + 0.02 * gap_s
-        self._graph.add_vehicle(
+        self._graph.add_chain(
             chain, time_s, start_m, expected_m + moved_m, start_sigma_m=1e4, like=before
         )
         try:

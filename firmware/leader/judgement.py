@@ -240,19 +240,19 @@ class _Odometry:
             )
         ]
         self._noise, self._drift_sigma_mps = graph.wandering.noise, settings.drift_sigma_mps
-        self._vehicle = np.array([vehicle for vehicle, _, _ in ends])
+        self._chain = np.array([chain for chain, _, _ in ends])
         self._time_s = np.array([time_s for _, time_s, _ in ends])
         self._reckoned_m = np.array([reckoned_m for _, _, reckoned_m in ends])
-        self._bias_mps = np.array([graph.trajectory(v).bias_at(t) for v, t, _ in ends])
+        self._bias_mps = np.array([graph.trajectory(chain).bias_at(t) for chain, t, _ in ends])
 
     def __call__(self, first: Keys, second: Keys) -> tuple[Array, Array]:
-        """Return offsets (P, 2) and covariances (P, 2, 2), NaN between vehicles."""
+        """Return offsets (P, 2) and covariances (P, 2, 2), NaN between chains."""
         later_s = self._time_s[second] - self._time_s[first]
         bias_mps = (self._bias_mps[first] + self._bias_mps[second]) / 2.0
         offset_m = self._reckoned_m[second] - self._reckoned_m[first] - bias_mps * later_s[:, None]
         apart_s = np.abs(later_s)
         variance_m2 = self._noise**2 * apart_s + (self._drift_sigma_mps * apart_s) ** 2
-        other = self._vehicle[first] != self._vehicle[second]
+        other = self._chain[first] != self._chain[second]
         offset_m[other], variance_m2[other] = np.nan, np.nan
         return offset_m, variance_m2[:, None, None] * np.eye(2)
 

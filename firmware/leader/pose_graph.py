@@ -46,9 +46,9 @@ class PoseGraph(Estimate):
         super().__init__(settings)
         self._entered = 0
 
-    def add_vehicle(
+    def add_chain(
         self,
-        vehicle: int,
+        chain_id: int,
         time_s: float,
         reckoned_m: Array,
         start_m: Array,
@@ -66,7 +66,7 @@ class PoseGraph(Estimate):
         chain = Chain(number=number, parameters=gtsam.symbol("p", number))
         if number > 0 and s.clock_offset_sigma_ms > 0.0:
             chain.clock = self._clock_of(number, like)
-        self._chains[vehicle] = chain
+        self._chains[chain_id] = chain
         state = np.concatenate([start_m, np.zeros(2)])
         key = self._append(chain, time_s, reckoned_m, state)
         self._solver.introduce(chain.parameters, np.zeros(2))
@@ -87,7 +87,7 @@ class PoseGraph(Estimate):
                 )
             )
 
-    def extend(self, vehicle: int, track: Track) -> int:
+    def extend(self, chain_id: int, track: Track) -> int:
         """Add the nodes that a vehicle's newly known track allows; return how many.
 
         Epochs in a gap of the track are passed over: positions are composed, so the next node
@@ -95,7 +95,7 @@ class PoseGraph(Estimate):
         """
         if not track.time_s.size:
             return 0
-        chain, s = self._chains[vehicle], self._settings
+        chain, s = self._chains[chain_id], self._settings
         interval_s = s.node_interval_s
         first = np.floor(chain.times_s[-1] / interval_s + 1e-9) + 1
         last = np.floor(track.time_s[-1] / interval_s + 1e-9)
@@ -111,17 +111,17 @@ class PoseGraph(Estimate):
                 added += 1
         return added
 
-    def lose(self, vehicle: int, begin_s: float, end_s: float) -> None:
+    def lose(self, chain_id: int, begin_s: float, end_s: float) -> None:
         """Say of a span, before it has nodes, that nobody knows how far a vehicle went in it."""
-        self._chains[vehicle].lose(begin_s, end_s)
+        self._chains[chain_id].lose(begin_s, end_s)
 
-    def set_back(self, vehicle: int, from_s: float, to_s: float) -> None:
+    def set_back(self, chain_id: int, from_s: float, to_s: float) -> None:
         """Doubt the way on from a vehicle's newest node, since its clock was set back.
 
         Once the clock has caught up with that node it tells of less time than may have passed: the
         way is as unsure as dead reckoning for as long, as if navigation had been lost.
         """
-        chain, s = self._chains[vehicle], self._settings
+        chain, s = self._chains[chain_id], self._settings
         passed_m2 = reckoned_m2(
             from_s - to_s, s.odometry_noise, self._walk, drift_mps=s.bias_sigma_mps
         )
@@ -201,17 +201,17 @@ class PoseGraph(Estimate):
         estimate = self._states()
         pinned, detail_s = pinned_keys(self._ledger.values()), detail_from_s(now_s, settings)
         kept = {
-            vehicle: kept_nodes(chain, now_s, pinned, settings)
-            for vehicle, chain in self._chains.items()
+            chain_id: kept_nodes(chain, now_s, pinned, settings)
+            for chain_id, chain in self._chains.items()
         }
         owners: dict[int, int] = {}
-        for vehicle, chain in self._chains.items():
-            owners |= chain.owners(kept[vehicle])
+        for chain_id, chain in self._chains.items():
+            owners |= chain.owners(kept[chain_id])
         apart_m2 = self.apart_m2(owners)
-        shapes = {vehicle: self.trajectory(vehicle).until(detail_s) for vehicle in self._chains}
+        shapes = {chain_id: self.trajectory(chain_id).until(detail_s) for chain_id in self._chains}
         self._walk = walk
-        for vehicle, chain in self._chains.items():
-            chain.drop(kept[vehicle], shapes[vehicle], apart_m2)
+        for chain_id, chain in self._chains.items():
+            chain.drop(kept[chain_id], shapes[chain_id], apart_m2)
         old = {
             key
             for chain in self._chains.values()

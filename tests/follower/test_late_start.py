@@ -36,7 +36,7 @@ def test_a_chain_that_begins_late_begins_uncertain(
     begins_s: float, least_m: float, most_m: float
 ) -> None:
     graph = PoseGraph(GraphSettings())
-    graph.add_vehicle(0, begins_s, HERE_M, HERE_M)
+    graph.add_chain(0, begins_s, HERE_M, HERE_M)
     graph.update()
     told_m = float(np.sqrt(graph.predicted_covariance(0, begins_s)[0, 0]))
     assert least_m < told_m < most_m

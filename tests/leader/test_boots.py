@@ -73,7 +73,7 @@ def test_restarts_beyond_the_header_s_four_bits_are_still_told_apart() -> None:
         )
         leader.receive_frame(frame, None, 20.0 * boot + 20.0)
     assert leader.status()["restarts"] == 19
-    assert len(leader.graph.vehicles()) == 21
+    assert len(leader.graph.chains()) == 21
     assert leader.vehicles() == [0, 1]
 
 
@@ -96,7 +96,7 @@ def test_late_frame_is_none_of_a_new_boot_however_far_epochs_lie_apart(epoch: in
             changed(trajectory(walked(20, 2.0 * first_s), first_s), boot_epoch=boot), None, 100.0
         )
     assert leader.status()["restarts"] == 1
-    assert [len(leader.fleet.track(chain).time_s) for chain in leader.graph.vehicles()[1:]] == [
+    assert [len(leader.fleet.track(chain).time_s) for chain in leader.graph.chains()[1:]] == [
         40,
         40,
     ]
@@ -118,7 +118,7 @@ def test_late_frame_of_a_boot_never_heard_does_not_start_another() -> None:
             changed(trajectory(walked(20, 2.0 * first_s), first_s), boot_epoch=boot), None, 100.0
         )
     assert leader.status().get("restarts", 0) == 0
-    assert len(leader.graph.vehicles()) == 3
+    assert len(leader.graph.chains()) == 3
     assert leader.track(1).time_s == pytest.approx([*range(20, 40), *range(60, 100)])
 
 

@@ -37,7 +37,7 @@ def ranged(settings: GraphSettings) -> PoseGraph:
     graph, tracks = PoseGraph(settings), [track(0), track(1)]
     for vehicle in (0, 1):
         start_m = tracks[vehicle].position_at(0.0)
-        graph.add_vehicle(vehicle, 0.0, start_m, start_m)
+        graph.add_chain(vehicle, 0.0, start_m, start_m)
         graph.extend(vehicle, tracks[vehicle])
     ranging, header = RangeWindows(RangeSettings()), replace(paper_packet().header, tx_second=0)
     for sent_s in range(16, int(END_S) - 16, 16):

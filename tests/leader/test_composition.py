@@ -56,7 +56,7 @@ class Voyage:
         self.graph = PoseGraph(GraphSettings())
         for vehicle, (track, true_m) in enumerate(self.tracks):
             start_m = np.array([track.north_m[0], track.east_m[0]])
-            self.graph.add_vehicle(vehicle, 0.0, start_m, true_m[0])
+            self.graph.add_chain(vehicle, 0.0, start_m, true_m[0])
         self.nodes: list[int] = []
         self.records: list[int] = []
 

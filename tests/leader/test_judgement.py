@@ -21,7 +21,7 @@ def moored() -> tuple[PoseGraph, Track]:
     north_m = TIDE_MPS / turn * (1.0 - np.cos(turn * time_s))
     track = Track(time_s=time_s, north_m=north_m, east_m=0.0 * time_s, yaw_rad=0.0 * time_s)
     graph = PoseGraph(GraphSettings(node_interval_s=60.0))
-    graph.add_vehicle(0, 0.0, np.zeros(2), np.zeros(2))
+    graph.add_chain(0, 0.0, np.zeros(2), np.zeros(2))
     graph.extend(0, track)
     for fix_s in range(300, int(time_s[-1]) + 1, 300):
         graph.add_absolute(graph.anchor(0, float(fix_s), track), np.zeros(2), np.eye(2))

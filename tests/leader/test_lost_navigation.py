@@ -208,7 +208,7 @@ def test_a_short_loss_costs_no_more_doubt_than_it_is_long() -> None:
         frame = follower.poll(now_s)
         if frame is not None:
             leader.receive_frame(frame, None, now_s + 1.0)
-    before, after = sorted(leader.graph.vehicles())[1:]
+    before, after = sorted(leader.graph.chains())[1:]
     gap_s = leader.fleet.track(after).time_s[0] - leader.fleet.track(before).time_s[-1]
     assert 10.0 < gap_s < 17.0
 

@@ -38,7 +38,7 @@ class Pair:
         for vehicle, true_m in enumerate(self.true_m):
             steps_m = rng.normal(0.0, 0.2, (DURATION_S, 2)) + rng.normal(0.0, 0.15, 2)
             self.reckoned_m.append(true_m + np.cumsum(np.vstack([np.zeros(2), steps_m]), axis=0))
-            self.graph.add_vehicle(vehicle, 0.0, true_m[0], true_m[0])
+            self.graph.add_chain(vehicle, 0.0, true_m[0], true_m[0])
         for now_s in range(4, DURATION_S - 20, 4):
             distance_m = float(np.hypot(*(self.true_m[1][now_s] - self.true_m[0][now_s])))
             stretch = 1.1 if rng.random() < 0.2 else 1.0

@@ -23,7 +23,7 @@ def graph_of(*, ranges: bool, closures: bool) -> PoseGraph:
     ]
     for vehicle, track in enumerate(tracks):
         start_m = track.position_at(0.0)
-        graph.add_vehicle(vehicle, 0.0, start_m, start_m)
+        graph.add_chain(vehicle, 0.0, start_m, start_m)
         graph.extend(vehicle, track)
     for second in range(0, SECONDS + 1, 20):
         ends = [graph.anchor(v, float(second), track) for v, track in enumerate(tracks)]

@@ -319,7 +319,7 @@ def test_match_takes_the_place_of_the_hint(graph: PoseGraph) -> None:
 @pytest.fixture
 def graph() -> PoseGraph:
     graph = PoseGraph(GraphSettings())
-    graph.add_vehicle(0, 0.0, np.zeros(2), np.zeros(2))
+    graph.add_chain(0, 0.0, np.zeros(2), np.zeros(2))
     graph.extend(0, _long_track())
     graph.update()
     return graph

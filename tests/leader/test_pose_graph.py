@@ -37,7 +37,7 @@ def walk(rng: np.random.Generator, seconds: int, heading_rad: float) -> tuple[Tr
 def started(track: Track, vehicle: int = 0, graph: PoseGraph | None = None) -> PoseGraph:
     graph = graph or PoseGraph(SETTINGS)
     start_m = np.array([track.north_m[0], track.east_m[0]])
-    graph.add_vehicle(vehicle, 0.0, start_m, start_m)
+    graph.add_chain(vehicle, 0.0, start_m, start_m)
     graph.extend(vehicle, track)
     return graph
 
@@ -173,7 +173,7 @@ def test_time_without_a_node_is_an_error_that_names_the_nearest() -> None:
     track, _ = walk(np.random.default_rng(6), 100, 0.0)
     with pytest.raises(EstimationError, match=r"no node near 500\.0 s; the nearest is at 100\.0 s"):
         started(track).anchor(0, 500.0, track)
-    with pytest.raises(EstimationError, match="vehicle 7 has no chain"):
+    with pytest.raises(EstimationError, match="no chain 7"):
         started(track).anchor(7, 10.0, track)
 
 

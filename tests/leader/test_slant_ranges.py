@@ -68,7 +68,7 @@ def ranged(
     tracks = [still(0.0, 0.0), still(0.0, apart_m)]
     for vehicle, track in enumerate(tracks):
         start_m = track.position_at(0.0)
-        graph.add_vehicle(vehicle, 0.0, start_m, start_m)
+        graph.add_chain(vehicle, 0.0, start_m, start_m)
         graph.extend(vehicle, track)
     header = replace(paper_packet().header, tx_second=0)
     for toa_s in arrived_s:

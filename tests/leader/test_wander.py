@@ -76,7 +76,7 @@ def test_vehicles_that_share_a_drift_do_not_vouch_for_stillness(vehicles: int) -
     track = Track(time_s=times_s, north_m=2 * times_s, east_m=0 * times_s, yaw_rad=0 * times_s)
     graph = PoseGraph(GraphSettings())
     for vehicle in range(vehicles):
-        graph.add_vehicle(vehicle, 0.0, np.zeros(2), np.zeros(2))
+        graph.add_chain(vehicle, 0.0, np.zeros(2), np.zeros(2))
         graph.extend(vehicle, track)
     for _ in range(4):
         graph.compose(2400.0, CompositionSettings())
@@ -96,7 +96,7 @@ def _laps(current_mps: Array, rng: np.random.Generator) -> PoseGraph:
     north_m, east_m = (true_m + drift_m).T
     track = Track(time_s=time_s, north_m=north_m, east_m=east_m, yaw_rad=angle)
     graph = PoseGraph(GraphSettings())
-    graph.add_vehicle(0, 0.0, true_m[0] + drift_m[0], true_m[0])
+    graph.add_chain(0, 0.0, true_m[0] + drift_m[0], true_m[0])
     graph.extend(0, track)
     for fix_s in range(120, len(time_s), 120):
         graph.add_absolute(graph.anchor(0, float(fix_s), track), true_m[fix_s], np.eye(2))

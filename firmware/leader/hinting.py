@@ -20,6 +20,7 @@ _PROFILE_SIGMAS = 0.25  # of a region, between shifts that are held side by side
 _MOST_BINS = 160  # of a profile, however far it reaches
 _LEAST_SHARE = 1e-6  # of the prior's variance that a region has left, for its own scale
 _CONTRADICTION = 2.0  # nats of misfit that end a region, where it is
+_DATUM_FLOOR_M = 0.1  # of a depth offset: slopes and decoding shift the mean of an overlap
 _ASKEW_RAD = 0.03  # sigma of the axis of a hint along one only
 _UNLIKE = 0.1  # of the misfit of unrelated seabed: drift makes so much of the relief itself
 _NO_INFORMATION = 1e4  # variances of the prior
@@ -34,6 +35,7 @@ def hint_of(
     settings, surface = problem.settings, problem.strained(surface)
     cautious = _cautious(problem, surface, relief, prior)
     evidence = ambiguity.tempered_evidence(surface, cautious, problem.correlated_cells)
+    evidence -= _depth_misfit(problem, surface)
     found = ambiguity.posterior(surface, evidence, prior, settings.null_share)
     mean_m, covariance_m2 = ambiguity.moments(found, prior)
     root = np.linalg.cholesky(prior.covariance_m2)
@@ -67,11 +69,25 @@ def _shifts_from(surface: ErrorSurface, mean_m: Array) -> Array:
     return np.stack([surface.north_m[row], surface.east_m[column]]) - mean_m[:, None]
 
 
+def _depth_misfit(problem: PairProblem, surface: ErrorSurface) -> Array:
+    """Return what the depth offset between the sub-maps speaks against each shift, in nats.
+
+    On a slope that goes on, it alone tells how far along they lie. Tide and sensor may have
+    wandered: a t-distribution of three degrees of freedom forgives them a few sigmas.
+    """
+    told_m = problem.settings.depth_offset_sigma_m
+    if told_m == 0.0:
+        return np.zeros(surface.overlap_cells.shape)
+    variance_m2 = told_m**2 + problem.strained_m2 + _DATUM_FLOOR_M**2
+    offset_m = np.where(np.isfinite(surface.residual_m2), surface.depth_offset_m, 0.0)
+    return np.asarray(2.0 * np.log1p(offset_m**2 / (3.0 * variance_m2)))
+
+
 def _contradicted(problem: PairProblem, surface: ErrorSurface, relief: Relief) -> NDArray[np.bool_]:
     """Return at which shifts (K L,) that overlap the two sub-maps contradict each other.
 
-    Misfit grows with the overlap wherever drift bends what is compared: it has to be a good part
-    of what unrelated seabed shows as well, lest it end a ridge that goes on.
+    Misfit grows with the overlap wherever drift bends what is compared: it has to be a good part of
+    what unrelated seabed shows as well, lest it end a ridge that goes on.
     """
     error = surface.residual_m2 / surface.noise_m2
     least = float(error.min())

@@ -79,10 +79,14 @@ class PairProblem:
         area = 2.0 * np.pi * (self.settings.correlation_m / self.query.grid.cell_m) ** 2
         return float(_RESAMPLED_CELLS * (1.0 + 0.5 * self.noise.correlated_share * area))
 
+    @property
+    def strained_m2(self) -> float:
+        """What drift inside the sub-maps does to a cell's depth, which slopes to two sides."""
+        return 2.0 * self.settings.strain_sigma_m**2 * self.slope2
+
     def strained(self, surface: ErrorSurface) -> ErrorSurface:
         """Return a surface of which noise also explains what drift inside the sub-maps does."""
-        strained_m2 = 2.0 * self.settings.strain_sigma_m**2 * self.slope2  # north and east
-        return dataclasses.replace(surface, noise_m2=surface.noise_m2 + strained_m2)
+        return dataclasses.replace(surface, noise_m2=surface.noise_m2 + self.strained_m2)
 
     def information(
         self, noise_scale: float, *, strain_m: float = 0.0, longest_m: float = np.inf

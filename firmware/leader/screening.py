@@ -45,7 +45,8 @@ class ErrorSurface:
     """Residual error over lattice shifts (K,), (L,): what to add to the query's coordinates.
 
     residual_m2 is E with the depth offset taken out, inf where overlap_cells <= N_T; noise_m2 is
-    what the layers' noise alone would make of it; (K, L).
+    what the layers' noise alone would make of it; depth_offset_m is the reference's depth less the
+    query's; (K, L).
     """
 
     north_m: Array

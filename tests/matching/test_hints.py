@@ -78,3 +78,35 @@ def test_a_straight_ridge_tells_no_hint_how_far_along_it_sub_maps_lie() -> None:
         assert along @ left_m2 @ along > 0.9 * 60.0**2
         assert normal @ left_m2 @ normal < 0.5 * 60.0**2
     assert hints >= 2
+
+
+def test_on_a_slope_the_depth_tells_waves_apart_that_look_alike() -> None:
+    """The next wave lies two metres deeper; tide and sensor wander by 0.3 m."""
+
+    def waves_m(north_m: Array, east_m: Array) -> Array:
+        return np.asarray(
+            60.0 + north_m / 30.0 + 0.4 * np.sin(np.pi * north_m / 30.0) + 0.0 * east_m
+        )
+
+    prior_m2, squares, gained = 40.0**2 * np.eye(2), [], 0
+    for seed in range(12):
+        scene = Scene(seed)
+        truth_m = scene.rng.uniform(-45.0, 45.0, 2)  # where the sub-maps overlap by half
+        reference = scene.submap(200, 130, (60, 41), relief=waves_m)
+        query = scene.submap(
+            210,
+            150,
+            (60, 41),
+            shift_m=(truth_m[0], truth_m[1]),
+            relief=waves_m,
+            offset_m=float(scene.rng.normal(0.0, 0.3)),
+        )
+        hint = match(reference, query, np.zeros(2), prior_m2, STILL).hint
+        if hint is None:
+            continue
+        left_m2 = np.linalg.inv(np.linalg.inv(prior_m2) + np.linalg.inv(hint.covariance_m2))
+        away_m = truth_m - left_m2 @ np.linalg.solve(hint.covariance_m2, hint.shift_m)
+        squares.append(float(away_m[0] ** 2 / left_m2[0, 0]))
+        gained += left_m2[0, 0] < 15.0**2
+    assert gained >= 4
+    assert np.mean(squares) < 3.0

@@ -1,12 +1,12 @@
-"""What both loops do with their ports: read the modem, read the sensors, write the modem."""
+"""What a loop does with its ports: read the modem, read the sensors, write the modem."""
 
 import logging
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
-from typing import Protocol
 
 from firmware.soundings import Odometry, Ping
+from firmware.vehicle_core import Navigator
 from protocol.modems.base import Modem, Reception
 
 LOG = logging.getLogger(__name__)
@@ -14,16 +14,6 @@ SensorStep = tuple[Odometry, Ping | None]
 _SAME_INSTANT_S = 1e-6
 _FAR_AHEAD_S = 2.0  # no sensor measures so far ahead of our clock
 _MOST_AHEAD = 64  # of them wait, a quarter of a minute of navigation; twice as many are looked at
-
-
-class Navigator(Protocol):
-    """The part of a core that takes what the sensors say."""
-
-    def receive_odometry(self, odometry: Odometry) -> None:
-        """Take navigation."""
-
-    def receive_ping(self, ping: Ping) -> None:
-        """Take a ping."""
 
 
 class SensorPort:

@@ -11,6 +11,7 @@ from firmware.follower.loop import FollowerLoop
 from firmware.leader.core import LeaderCore
 from firmware.leader.loop import LeaderLoop
 from firmware.leader.worker import InlineWorker
+from firmware.vehicle_loop import VehicleLoop
 from hil.benches import Bench
 from host_tools.commands import parse_changes
 from host_tools.mission import deployed, simulated_vehicles
@@ -77,7 +78,7 @@ class BenchMission:
         slots = Slots(settings.slots)
         self.leader = LeaderCore(0, at[0][0], settings=settings.leader, slots=slots)
         self.follower = FollowerCore(1, 0, at[1][0], settings=settings.follower, slots=slots)
-        self._loops: list[LeaderLoop | FollowerLoop] = [
+        self._loops: list[VehicleLoop] = [
             LeaderLoop(self.leader, leader, at[0][2], InlineWorker(), lambda: 0.0, PERIOD_S),
             FollowerLoop(self.follower, follower, at[1][2], lambda: 0.0, PERIOD_S),
         ]

@@ -15,6 +15,7 @@ from firmware.leader.journaled import JournaledLeader
 from firmware.leader.loop import LeaderLoop
 from firmware.leader.worker import InlineWorker
 from firmware.ports import SensorStep
+from firmware.vehicle_loop import VehicleLoop
 from host_tools.faults.catalogue import Fault, plan_of
 from host_tools.faults.computer import LocalClock, Program
 from host_tools.faults.disk import Fate, FatedJournal
@@ -64,7 +65,7 @@ def taken(core: Journaled) -> int:
 class Sailor:
     """A vehicle's loop for one life, and what it may say afterwards to have taken."""
 
-    def __init__(self, core: Journaled, loop: FollowerLoop | LeaderLoop) -> None:
+    def __init__(self, core: Journaled, loop: VehicleLoop) -> None:
         self.core, self.loop = core, loop
         self.acknowledged = taken(core)
 
@@ -228,9 +229,7 @@ class MissionTrial:
             self.violations.append(f"vehicle {vehicle} lost {lost} frames that it acknowledged")
 
 
-def _loop(
-    core: Journaled, modem: SealedModem, steps: Iterator[SensorStep]
-) -> FollowerLoop | LeaderLoop:
+def _loop(core: Journaled, modem: SealedModem, steps: Iterator[SensorStep]) -> VehicleLoop:
     if isinstance(core, JournaledLeader):
         return LeaderLoop(core, modem, steps, InlineWorker(), lambda: 0.0, TICK_S)
     return FollowerLoop(core, modem, steps, lambda: 0.0, TICK_S)

@@ -24,6 +24,7 @@ from firmware.leader.core import LeaderCore
 from firmware.leader.loop import LeaderLoop
 from firmware.leader.worker import InlineWorker, ThreadWorker, Worker
 from firmware.ports import SensorStep
+from firmware.vehicle_loop import VehicleLoop
 from host_tools.collect import leader_record
 from host_tools.commands import Command
 from host_tools.link_status import advice_lines
@@ -60,7 +61,7 @@ WALL = "wall"
 class Aboard:
     """A vehicle's loop with what it was started from."""
 
-    loop: FollowerLoop | LeaderLoop
+    loop: VehicleLoop
     worker: Worker
     voyage: Voyage
     truth_map: DepthMap
@@ -200,7 +201,7 @@ def _loop(
     worker: Worker,
     stopwatch: Callable[[], float],
     period_s: float,
-) -> LeaderLoop | FollowerLoop:
+) -> VehicleLoop:
     if isinstance(core, LeaderCore):
         return LeaderLoop(core, modem, steps, worker, stopwatch, period_s)
     return FollowerLoop(core, modem, steps, stopwatch, period_s)

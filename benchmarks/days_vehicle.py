@@ -21,6 +21,7 @@ from threadpoolctl import threadpool_limits
 from firmware.dead_reckoning import ReckonedState
 from firmware.heap import give_back_large_blocks
 from firmware.journal import Journal, JournalSettings, Owner
+from firmware.journaled import bare
 from firmware.ports import SensorStep
 from host_tools.nodes import BeliefLog, FollowerNode, LeaderNode
 from protocol.schedule import Slots, SlotSettings
@@ -115,14 +116,14 @@ def _gauge(node: LeaderNode | FollowerNode, now_s: float, *, compare: bool) -> G
     if isinstance(node, FollowerNode):
         position_m = node.core.belief().position_m
         return Gauge(time_s=now_s, cpu_s=cpu_s, resident_mb=resident_mb, position_m=position_m)
-    core = node.core
+    core = bare(node.core)
     if compare:
         before_m = np.concatenate([core.trajectory(v).position_m for v in core.vehicles()])
         core.graph.solve_batch()
         after_m = np.concatenate([core.trajectory(v).position_m for v in core.vehicles()])
         position_m = np.hypot(*(after_m - before_m).T)
     else:
-        position_m = core.belief().position_m
+        position_m = node.core.belief().position_m
     return Gauge(
         time_s=now_s,
         cpu_s=cpu_s,

@@ -92,13 +92,17 @@ def mortal_mission(
 
 def apart_m(one: Outcome, other: Outcome) -> float:
     """Return the largest distance between the final estimates of any vehicle at any second."""
-    return max(_apart_m(one.leader, other.leader, vehicle) for vehicle in one.leader.vehicles())
+    return max(
+        _apart_m(one.leader, other.leader, vehicle) for vehicle in one.leader.core.vehicles()
+    )
 
 
 def _apart_m(one: JournaledLeader, other: JournaledLeader, vehicle: int) -> float:
-    track = one.track(vehicle)
+    track = one.core.track(vehicle)
     reckoned_m: Array = np.column_stack([track.north_m, track.east_m])
-    ends = [leader.trajectory(vehicle).correct(track.time_s, reckoned_m) for leader in (one, other)]
+    ends = [
+        leader.core.trajectory(vehicle).correct(track.time_s, reckoned_m) for leader in (one, other)
+    ]
     return float(np.max(np.hypot(*(ends[0] - ends[1]).T)))
 
 

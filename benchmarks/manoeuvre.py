@@ -19,6 +19,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from firmware.geometry import Array
+from firmware.journaled import bare
 from firmware.leader.core import LeaderCore
 from firmware.leader.manoeuvre import Proposal
 from host_tools.commands import add_survey_arguments, count, settings_of, status_of
@@ -49,7 +50,7 @@ def sail(
 
     def watch(now_s: float) -> None:
         if now_s == survey_s:
-            outcome.proposal = leader.core.outlook.propose()
+            outcome.proposal = bare(leader.core).outlook.propose()
             for vehicle in vehicles:
                 vehicle.steer(survey_s + CHUNK_S, _heading(outcome.proposal, vehicle, follow))
 
@@ -61,7 +62,7 @@ def sail(
         record=lambda _: None,
         progress=watch,
     )
-    outcome.errors_m = np.array([_error_m(leader.core, vehicle) for vehicle in vehicles])
+    outcome.errors_m = np.array([_error_m(bare(leader.core), vehicle) for vehicle in vehicles])
     return outcome
 
 

@@ -2,11 +2,11 @@
 
 import io
 import pickle
-from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 from firmware.store_file import StoreUnusableError
 
+T = TypeVar("T")
 _ROOMS = ("firmware.", "protocol.")
 _OTHERS = {
     ("collections", "deque"),
@@ -24,8 +24,8 @@ class NotNowError(Exception):
     """The core is in the middle of work that cannot be written down."""
 
 
-def written(state: Mapping[str, object], marks: tuple[object, ...]) -> bytes:
-    """Return a core's attributes and its recorder's marks as bytes.
+def written(core: object, marks: tuple[object, ...]) -> bytes:
+    """Return a core and its recorder's marks as bytes.
 
     Raises
     ------
@@ -33,13 +33,13 @@ def written(state: Mapping[str, object], marks: tuple[object, ...]) -> bytes:
         While the core holds an iterator, such as a fit at work.
     """
     try:
-        return pickle.dumps((dict(state), marks), protocol=5)
+        return pickle.dumps((core, marks), protocol=5)
     except TypeError as error:
         raise NotNowError(str(error)) from error
 
 
-def read(body: bytes) -> tuple[dict[str, Any], tuple[Any, ...]]:
-    """Return the attributes and marks of bytes.
+def read(body: bytes, kind: type[T]) -> tuple[T, tuple[Any, ...]]:
+    """Return the core, of its kind, and the marks of bytes.
 
     Raises
     ------
@@ -47,10 +47,13 @@ def read(body: bytes) -> tuple[dict[str, Any], tuple[Any, ...]]:
         For bytes that are no checkpoint of this program.
     """
     try:
-        state, marks = _Reader(io.BytesIO(body)).load()
-        return dict(state), tuple(marks)
+        core, marks = _Reader(io.BytesIO(body)).load()
+        marks = tuple(marks)
     except Exception as error:  # a damaged pickle may raise anything
         raise StoreUnusableError(f"its checkpoint cannot be read: {error}") from error
+    if not isinstance(core, kind):
+        raise StoreUnusableError(f"its checkpoint is of a {type(core).__name__}")
+    return core, marks
 
 
 class _Reader(pickle.Unpickler):

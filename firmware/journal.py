@@ -189,6 +189,9 @@ class Journal:
 
     def count_epoch(self, epoch: int) -> None:
         """Count an epoch that a core has begun by itself: its next life takes another."""
+        if epoch == self.boot_epoch:
+            return
+        self.boot_epoch = epoch
         try:
             self._epochs.write(epoch)
         except OSError:

@@ -9,7 +9,6 @@ comes by a clock that was set back, and is new.
 import logging
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 from firmware.inputs import (
@@ -28,22 +27,12 @@ from firmware.inputs import (
 from firmware.journal import Journal
 from firmware.soundings import Odometry, Ping
 from firmware.store_file import StoreUnusableError
+from firmware.vehicle_core import VehicleCore
 
 LOG = logging.getLogger(__name__)
 _NEVER_S = -float("inf")
 _REPEATED_S = 5.0  # before the journal's end; a commit a second leaves less to be repeated
 _HEARD_AGAIN = 256  # frames that a modem may hand over a second time: its own cap of events
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CoreInputs:
-    """What every core is given and asked, past its journal."""
-
-    odometry: Callable[[Odometry], None]
-    ping: Callable[[Ping], None]
-    frame: Callable[[bytes, float | None, float], None]
-    tick: Callable[[float], None]
-    poll: Callable[[float], bytes | None]
 
 
 class Recorder:
@@ -161,7 +150,7 @@ class Recorder:
 
     # replay
 
-    def replay(self, core: CoreInputs, other: Callable[[int, bytes], None]) -> None:
+    def replay(self, core: VehicleCore, other: Callable[[int, bytes], None]) -> None:
         """Give a core what the journal holds, and what only its sort is asked to the other.
 
         Raises StoreUnusableError for a record that is none. Whatever else an input raises, it
@@ -179,23 +168,23 @@ class Recorder:
         self.journal.counters["store_resumed"] += 1
 
     def _replay(
-        self, kind: int, body: bytes, core: CoreInputs, other: Callable[[int, bytes], None]
+        self, kind: int, body: bytes, core: VehicleCore, other: Callable[[int, bytes], None]
     ) -> None:
         match kind:
             case Kind.ODOMETRY:
                 odometry = to_odometry(body)
                 self.last_odometry_s = odometry.time_s
-                core.odometry(odometry)
+                core.receive_odometry(odometry)
             case Kind.PING:
                 ping = to_ping(body, self._fan or b"")
                 self._last_ping_s = ping.time_s
-                core.ping(ping)
+                core.receive_ping(ping)
             case Kind.FAN:
                 self._fan = body
             case Kind.FRAME:
                 heard = to_heard(body)
                 self._heard.append(heard)
-                core.frame(heard.frame, heard.toa_s, heard.now_s)
+                core.receive_frame(heard.frame, heard.toa_s, heard.now_s)
             case Kind.TICK:
                 self.last_tick_s = self._committed_s = to_instant(body)
                 core.tick(self.last_tick_s)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware.geometry import Array
+from firmware.journaled import bare
 from firmware.leader.closure_log import Verdict
 from firmware.leader.core import LeaderCore
 from firmware.leader.observability import Quantity
@@ -106,7 +107,7 @@ def mission_result(
     return result_of_record(
         mission,
         [leader.log.columns(), *(node.log.columns() for node in followers)],
-        leader_record(leader.core, time_s, mission.site.window),
+        leader_record(bare(leader.core), time_s, mission.site.window),
         {
             "leader": leader.core.status(),
             **{f"follower_{node.core.vehicle}": node.core.status() for node in followers},

@@ -13,10 +13,10 @@ import numpy as np
 
 from firmware.belief import Belief
 from firmware.dead_reckoning import ReckonedState
-from firmware.follower.journaled import JournaledFollower
 from firmware.journal import Journal, JournalSettings, Owner
-from firmware.leader.journaled import JournaledLeader
+from firmware.journaled import Journaled
 from firmware.ports import SensorStep
+from firmware.vehicle_core import VehicleCore
 from host_tools.nodes import BeliefLog, FollowerNode, LeaderNode, Steps
 
 _TAPE_STEPS = 256  # a minute of sensors: far more than a commit may lose
@@ -130,10 +130,10 @@ class MortalNode:
         self.node = self._started()
 
     @property
-    def core(self) -> JournaledLeader | JournaledFollower:
+    def core(self) -> Journaled[VehicleCore]:
         """The core of the present life."""
         core = self.node.core
-        assert isinstance(core, JournaledLeader | JournaledFollower)
+        assert isinstance(core, Journaled)
         return core
 
     @property

@@ -8,10 +8,13 @@ import numpy as np
 from firmware.belief import Belief
 from firmware.dead_reckoning import ReckonedState
 from firmware.soundings import Odometry, Ping
+from firmware.vehicle_core import Navigator
 
 if TYPE_CHECKING:  # a follower's process holds nothing of the leader
     from firmware.follower.core import FollowerCore
+    from firmware.follower.journaled import JournaledFollower
     from firmware.leader.core import LeaderCore
+    from firmware.leader.journaled import JournaledLeader
 
 Steps = Iterator[tuple[Odometry, Ping | None]]
 
@@ -74,7 +77,7 @@ class Node(Protocol):
 class FollowerNode:
     """A follower with its sensors."""
 
-    def __init__(self, core: "FollowerCore", steps: Steps) -> None:
+    def __init__(self, core: "FollowerCore | JournaledFollower", steps: Steps) -> None:
         self.core, self._steps, self.log = core, steps, BeliefLog()
 
     def hear(self, frame: bytes, toa_s: float | None, now_s: float) -> None:
@@ -93,7 +96,7 @@ class FollowerNode:
 class LeaderNode:
     """The leader with its sensors; matches run at once, so that a mission is deterministic."""
 
-    def __init__(self, core: "LeaderCore", steps: Steps) -> None:
+    def __init__(self, core: "LeaderCore | JournaledLeader", steps: Steps) -> None:
         self.core, self._steps, self.log = core, steps, BeliefLog()
 
     def hear(self, frame: bytes, toa_s: float | None, now_s: float) -> None:
@@ -111,7 +114,7 @@ class LeaderNode:
         return self.core.poll(now_s)
 
 
-def _feed(core: "FollowerCore | LeaderCore", steps: Steps) -> None:
+def _feed(core: Navigator, steps: Steps) -> None:
     step = next(steps, None)
     if step is None:
         return

@@ -5,6 +5,7 @@ from pathlib import Path
 from firmware.dead_reckoning import ReckonedState
 from firmware.follower.journaled import JournaledFollower
 from firmware.journal import Journal, JournalSettings, Owner
+from firmware.journaled import Journaled
 from firmware.leader.journaled import JournaledLeader
 from host_tools.mission_settings import MissionSettings
 from host_tools.nodes import FollowerNode, LeaderNode
@@ -56,7 +57,7 @@ def stored_nodes(
 def close_stores(nodes: list[LeaderNode | FollowerNode]) -> None:
     """Commit and close the stores of nodes that have one."""
     for node in nodes:
-        if isinstance(node.core, JournaledLeader | JournaledFollower):
+        if isinstance(node.core, Journaled):
             node.core.recorder.journal.close()
 
 

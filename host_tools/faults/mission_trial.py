@@ -11,10 +11,12 @@ import numpy as np
 
 from firmware.follower.loop import FollowerLoop
 from firmware.journal import JournalSettings, Owner
+from firmware.journaled import Journaled
 from firmware.leader.journaled import JournaledLeader
 from firmware.leader.loop import LeaderLoop
 from firmware.leader.worker import InlineWorker
 from firmware.ports import SensorStep
+from firmware.vehicle_core import VehicleCore
 from firmware.vehicle_loop import VehicleLoop
 from host_tools.faults.catalogue import Fault, plan_of
 from host_tools.faults.computer import LocalClock, Program
@@ -23,7 +25,7 @@ from host_tools.faults.held import held_bytes
 from host_tools.faults.rig import RECOVERY_S, Outcome, Rig
 from host_tools.faults.survey import Survey
 from host_tools.kills import KilledError
-from host_tools.processes.resume import Journaled, navigated, resumed_core, steps_since
+from host_tools.processes.resume import navigated, resumed_core, steps_since
 from protocol.acoustics import WaterSettings
 from protocol.modems.sealed import SealedModem
 
@@ -56,7 +58,7 @@ _SPOILERS = (Fault.STORE_CORRUPT, Fault.STORE_READ_ONLY)
 """Faults after which a store may be set aside, or done without."""
 
 
-def taken(core: Journaled) -> int:
+def taken(core: Journaled[VehicleCore]) -> int:
     """Return how many frames a core has taken in all its lives."""
     status = core.status()
     return sum(status.get(name, 0) for name in _TAKEN)
@@ -65,7 +67,7 @@ def taken(core: Journaled) -> int:
 class Sailor:
     """A vehicle's loop for one life, and what it may say afterwards to have taken."""
 
-    def __init__(self, core: Journaled, loop: VehicleLoop) -> None:
+    def __init__(self, core: Journaled[VehicleCore], loop: VehicleLoop) -> None:
         self.core, self.loop = core, loop
         self.acknowledged = taken(core)
 
@@ -176,7 +178,7 @@ class MissionTrial:
         if not isinstance(program, Sailor):
             return 0
         if isinstance(program.core, JournaledLeader):
-            return sum(sheet.id.vehicle == 1 for sheet in program.core.atlas)
+            return sum(sheet.id.vehicle == 1 for sheet in program.core.core.atlas)
         status = program.core.status()
         told = ("answers_used", "answers_without_news", "ranges_used")
         return sum(status[name] for name in told)
@@ -214,7 +216,7 @@ class MissionTrial:
         self._sailors[vehicle] = Sailor(core, _loop(core, modem, steps))
         return self._sailors[vehicle]
 
-    def _hold_to_account(self, vehicle: int, core: Journaled, fate: Fate) -> None:
+    def _hold_to_account(self, vehicle: int, core: Journaled[VehicleCore], fate: Fate) -> None:
         """Check that a restart has everything that an earlier life acknowledged."""
         owed = self._sailors[vehicle].acknowledged if vehicle in self._sailors else 0
         counters = core.recorder.journal.counters
@@ -229,7 +231,9 @@ class MissionTrial:
             self.violations.append(f"vehicle {vehicle} lost {lost} frames that it acknowledged")
 
 
-def _loop(core: Journaled, modem: SealedModem, steps: Iterator[SensorStep]) -> VehicleLoop:
+def _loop(
+    core: Journaled[VehicleCore], modem: SealedModem, steps: Iterator[SensorStep]
+) -> VehicleLoop:
     if isinstance(core, JournaledLeader):
         return LeaderLoop(core, modem, steps, InlineWorker(), lambda: 0.0, TICK_S)
     return FollowerLoop(core, modem, steps, lambda: 0.0, TICK_S)

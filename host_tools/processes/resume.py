@@ -10,9 +10,11 @@ from firmware.dead_reckoning import DeadReckoning, ReckonedState
 from firmware.follower.core import FollowerCore
 from firmware.follower.journaled import JournaledFollower
 from firmware.journal import Journal, JournalSettings, Owner
+from firmware.journaled import Journaled
 from firmware.leader.core import LeaderCore
 from firmware.leader.journaled import JournaledLeader
 from firmware.ports import SensorStep
+from firmware.vehicle_core import VehicleCore
 from host_tools.mission_settings import MissionSettings
 from host_tools.processes.voyage import Voyage
 from protocol.errors import ConfigError
@@ -23,8 +25,6 @@ PINGS_KEPT = 256
 """What the sensors hold for a computer that restarts: a minute of pings ..."""
 STEPS_KEPT = 100_000
 """... and seven hours of navigation."""
-
-Journaled = JournaledLeader | JournaledFollower
 
 
 class SilentModem:
@@ -68,7 +68,7 @@ def prepare_store(folder: Path) -> None:
 
 def open_core(
     vehicle: int, store: Path, start: ReckonedState, voyage: Voyage, first_s: float
-) -> Journaled:
+) -> JournaledLeader | JournaledFollower:
     """Return a vehicle's core as its store left it, or a new one with a store.
 
     Raises
@@ -88,7 +88,7 @@ def resumed_core(
     start: ReckonedState,
     settings: MissionSettings,
     first_s: float,
-) -> Journaled:
+) -> JournaledLeader | JournaledFollower:
     """Return a vehicle's core as its journal left it; one ahead of the clock is set aside."""
     core = _core(journal, vehicle, start, settings)
     reached_s = core.recorder.last_tick_s
@@ -110,7 +110,7 @@ def plain_core(
 
 def _core(
     journal: Journal, vehicle: int, start: ReckonedState, settings: MissionSettings
-) -> Journaled:
+) -> JournaledLeader | JournaledFollower:
     slots = Slots(settings.slots)
     if vehicle == 0:
         return JournaledLeader(journal, start, settings=settings.leader, slots=slots)
@@ -139,7 +139,7 @@ def navigated(
     return reckoning.state, [*navigation, *newest], steps
 
 
-def missed_instants(core: Journaled, first_s: float, tick_s: float) -> list[float]:
+def missed_instants(core: Journaled[VehicleCore], first_s: float, tick_s: float) -> list[float]:
     """Return the instants before the first tick that the store does not hold to their end."""
     from_s = core.recorder.unfinished_from_s(tick_s)
     if core.recorder.last_tick_s == -float("inf"):
@@ -147,7 +147,9 @@ def missed_instants(core: Journaled, first_s: float, tick_s: float) -> list[floa
     return [from_s + k * tick_s for k in range(round((first_s - from_s) / tick_s))]
 
 
-def steps_since(core: Journaled, passed: list[SensorStep], *, pings: bool) -> Iterator[SensorStep]:
+def steps_since(
+    core: Journaled[VehicleCore], passed: list[SensorStep], *, pings: bool
+) -> Iterator[SensorStep]:
     """Yield the steps so far that the core has not had."""
     known_s = core.recorder.last_odometry_s
     for odometry, ping in passed:

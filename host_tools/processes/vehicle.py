@@ -17,13 +17,15 @@ import numpy as np
 
 from firmware.boot_epochs import LIFE_S
 from firmware.clock import WallClock
-from firmware.follower.core import FollowerCore
 from firmware.follower.loop import FollowerLoop
 from firmware.heap import give_back_large_blocks
+from firmware.journaled import Journaled, bare
 from firmware.leader.core import LeaderCore
+from firmware.leader.journaled import JournaledLeader
 from firmware.leader.loop import LeaderLoop
 from firmware.leader.worker import InlineWorker, ThreadWorker, Worker
 from firmware.ports import SensorStep
+from firmware.vehicle_core import VehicleCore
 from firmware.vehicle_loop import VehicleLoop
 from host_tools.collect import leader_record
 from host_tools.commands import Command
@@ -32,7 +34,6 @@ from host_tools.mapping import DepthMap
 from host_tools.mission import deployed
 from host_tools.processes.records import VehicleFiles
 from host_tools.processes.resume import (
-    Journaled,
     SilentModem,
     missed_instants,
     navigated,
@@ -195,21 +196,21 @@ def _board(
 
 
 def _loop(
-    core: LeaderCore | FollowerCore,
+    core: VehicleCore,
     modem: Modem,
     steps: Iterator[SensorStep],
     worker: Worker,
     stopwatch: Callable[[], float],
     period_s: float,
 ) -> VehicleLoop:
-    if isinstance(core, LeaderCore):
+    if isinstance(core, LeaderCore | JournaledLeader):
         return LeaderLoop(core, modem, steps, worker, stopwatch, period_s)
     return FollowerLoop(core, modem, steps, stopwatch, period_s)
 
 
 def _catch_up(
     aboard: Aboard,
-    core: Journaled,
+    core: Journaled[VehicleCore],
     passed: list[SensorStep],
     first_s: float,
     *,
@@ -286,7 +287,7 @@ def start_time_s(text: str) -> float:
 
 
 @contextlib.contextmanager
-def _committed(core: LeaderCore | FollowerCore) -> Iterator[None]:
+def _committed(core: VehicleCore) -> Iterator[None]:
     """Commit to a core's store, if it has one, and close it behind what reads from its shelf."""
     journal = core.recorder.journal if isinstance(core, Journaled) else None
     if journal is not None:
@@ -303,7 +304,7 @@ def _write(aboard: Aboard, voyage: Voyage) -> None:
         print(_status_line(voyage.settings.scenario.duration_s, aboard.status()))
         return
     aboard.files.write_soundings(aboard.truth_map)
-    core = aboard.loop.core
+    core = bare(aboard.loop.core)
     if isinstance(core, LeaderCore):
         seconds = math.floor(voyage.settings.scenario.duration_s) + 1
         time_s = np.arange(0.0, seconds)

@@ -27,7 +27,7 @@ def test_plain_values_read_back() -> None:
         "ordered": OrderedDict(b=2),
         "enum": Profile.TRAJECTORY,
     }
-    back, marks = read(written(state, (1.0, None)))
+    back, marks = read(written(state, (1.0, None)), dict)
     assert marks == (1.0, None)
     np.testing.assert_array_equal(back.pop("array"), state.pop("array"))
     np.testing.assert_array_equal(back.pop("odd"), state.pop("odd"))
@@ -64,13 +64,18 @@ class Call:
 )
 def test_checkpoint_can_call_nothing(module: str, name: str) -> None:
     with pytest.raises(StoreUnusableError, match="cannot be read"):
-        read(Call(module, name).bytes())
+        read(Call(module, name).bytes(), object)
+
+
+def test_checkpoint_of_another_core_is_none() -> None:
+    with pytest.raises(StoreUnusableError, match="of a Counter"):
+        read(written(Counter(a=1), ()), deque)
 
 
 @pytest.mark.parametrize("junk", [b"", b"\x80", pickle.dumps(3), pickle.dumps((1, 2, 3))])
 def test_junk_is_no_checkpoint(junk: bytes) -> None:
     with pytest.raises(StoreUnusableError):
-        read(junk)
+        read(junk, object)
 
 
 @pytest.mark.parametrize("profile", ["paper", "dense", "lattice"])
@@ -87,19 +92,19 @@ def test_follower_of_every_profile_resumes_from_its_checkpoint(
         slots, start = Slots(settings.slots), deployed(vehicle)
         return JournaledFollower(journal, 1, start, settings=settings.follower, slots=slots)
 
-    core = follower()
+    first = follower()
     for odometry, ping in vehicle.steps():
         if odometry.time_s > 75.0:
             break
-        core.receive_odometry(odometry)
+        first.receive_odometry(odometry)
         if ping is not None:
-            core.receive_ping(ping)
-        core.tick(odometry.time_s)
-        core.poll(odometry.time_s)
-    core.recorder.journal.close()
-    assert core.recorder.journal.counters["store_checkpoints"] == 1
+            first.receive_ping(ping)
+        first.tick(odometry.time_s)
+        first.poll(odometry.time_s)
+    first.recorder.journal.close()
+    assert first.recorder.journal.counters["store_checkpoints"] == 1
     again = follower()
     later_s = np.arange(75.25, 120.0, 0.25)
-    assert [again.poll(t) for t in later_s] == [core.poll(t) for t in later_s]
-    assert again.counters == core.counters
-    assert again.belief().position_m.tolist() == core.belief().position_m.tolist()
+    assert [again.poll(t) for t in later_s] == [first.poll(t) for t in later_s]
+    assert again.core.counters == first.core.counters
+    assert again.belief().position_m.tolist() == first.belief().position_m.tolist()

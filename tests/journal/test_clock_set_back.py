@@ -19,22 +19,22 @@ def resumed(folder: Path) -> JournaledFollower:
     return JournaledFollower(journal, 1, start(PATH), settings=SETTINGS, slots=slots_of())
 
 
-def lived(core: JournaledFollower, from_s: float, to_s: float) -> list[bytes | None]:
+def lived(follower: JournaledFollower, from_s: float, to_s: float) -> list[bytes | None]:
     """Return what a follower without a sonar answers from one time to another."""
     answers = []
     for quarter in range(round(4 * from_s) + 1, round(4 * to_s) + 1):
-        sail(core, PATH, quarter / 4, sonar_on=False)
-        core.tick(quarter / 4)
-        answers.append(core.poll(quarter / 4))
+        sail(follower, PATH, quarter / 4, sonar_on=False)
+        follower.tick(quarter / 4)
+        answers.append(follower.poll(quarter / 4))
     return answers
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """A store of two minutes."""
-    core = resumed(tmp_path)
-    assert any(lived(core, 0.0, 120.0))
-    core.recorder.journal.close()
+    follower = resumed(tmp_path)
+    assert any(lived(follower, 0.0, 120.0))
+    follower.recorder.journal.close()
     return tmp_path
 
 
@@ -42,37 +42,37 @@ def folder(tmp_path: Path) -> Path:
 def test_a_clock_behind_the_store_makes_no_vehicle_deaf_and_mute(
     folder: Path, back_s: float
 ) -> None:
-    core = resumed(folder)
+    follower = resumed(folder)
     now_s = 120.0 - back_s
-    assert any(lived(core, now_s, now_s + 30.0))
-    assert core.recorder.last_tick_s == now_s + 30.0
-    assert core.recorder.last_odometry_s == now_s + 30.0
-    assert core.status()["store_clock_set_back"] == 1
+    assert any(lived(follower, now_s, now_s + 30.0))
+    assert follower.recorder.last_tick_s == now_s + 30.0
+    assert follower.recorder.last_odometry_s == now_s + 30.0
+    assert follower.status()["store_clock_set_back"] == 1
 
 
 def test_what_came_by_a_clock_set_back_is_replayed_as_it_came(folder: Path) -> None:
-    core = resumed(folder)
-    lived(core, 20.0, 60.0)
-    core.recorder.journal.close()
+    follower = resumed(folder)
+    lived(follower, 20.0, 60.0)
+    follower.recorder.journal.close()
     again = resumed(folder)
-    assert again.counters == core.counters
-    assert again.reckoned == core.reckoned
+    assert again.core.counters == follower.core.counters
+    assert again.reckoned == follower.reckoned
     assert again.recorder.last_tick_s == 60.0
 
 
 def test_what_the_store_holds_just_before_its_end_is_asked_for_in_vain(folder: Path) -> None:
-    core = resumed(folder)
-    sent, answers = core.counters["frames_sent"], lived(core, 116.0, 119.75)
+    follower = resumed(folder)
+    sent, answers = follower.core.counters["frames_sent"], lived(follower, 116.0, 119.75)
     assert not any(answers)
-    assert core.counters["frames_sent"] == sent
-    assert core.recorder.last_tick_s == 120.0
-    lived(core, 119.75, 124.0)
-    assert core.counters["frames_sent"] == sent + 2  # of 122 s and 124 s
-    assert core.status().get("store_clock_set_back", 0) == 0
+    assert follower.core.counters["frames_sent"] == sent
+    assert follower.recorder.last_tick_s == 120.0
+    lived(follower, 119.75, 124.0)
+    assert follower.core.counters["frames_sent"] == sent + 2  # of 122 s and 124 s
+    assert follower.status().get("store_clock_set_back", 0) == 0
 
 
 def test_a_leap_of_the_clock_puts_no_checkpoint_off_for_as_long(tmp_path: Path) -> None:
-    core = resumed(tmp_path)
+    follower = resumed(tmp_path)
     for now_s in (1.0, 36_000.0, *np.arange(2.0, 70.0, 0.25)):
-        core.tick(now_s)
-    assert core.recorder.journal.counters["store_checkpoints"] >= 2
+        follower.tick(now_s)
+    assert follower.recorder.journal.counters["store_checkpoints"] >= 2

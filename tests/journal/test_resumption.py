@@ -72,7 +72,7 @@ def mission(folder: Path, kills: int, seed: int = 4) -> Told:
     return Told(
         deliveries=deliveries,
         beliefs=[node.log.columns()["live_m"] for node in nodes.values()],
-        trajectories={v: leader.trajectory(v).position_m for v in leader.vehicles()},
+        trajectories={v: leader.core.trajectory(v).position_m for v in leader.core.vehicles()},
         counters=[
             {k: n for k, n in node.core.status().items() if not k.startswith("store")}
             for node in nodes.values()
@@ -124,7 +124,7 @@ def test_every_counter_is_what_it_would_have_been(undisturbed: Told, killed: Tol
 
 def test_ranges_keep_the_depth_that_they_arrived_at(undisturbed: Told, killed: Told) -> None:
     leaders = [told.nodes[0].core for told in (undisturbed, killed)]
-    ranges = [core._ranging._held for core in leaders if isinstance(core, JournaledLeader)]
+    ranges = [one.core._ranging._held for one in leaders if isinstance(one, JournaledLeader)]
     assert ranges[1] == ranges[0]
     assert len({one.depth_difference_m for one in ranges[0]}) > 1
 
@@ -156,22 +156,43 @@ def test_frames_of_a_slot_that_a_death_cuts_short_go_out_once_each(tmp_path: Pat
         journal = Journal(folder, Owner(vehicle=1, fingerprint="test"), JournalSettings())
         return JournaledFollower(journal, 1, start(path), settings=settings, slots=slots)
 
-    core = follower(tmp_path / "undisturbed")
+    first = follower(tmp_path / "undisturbed")
     for quarter in range(1, 4 * 32 + 1):
-        sail(core, path, quarter / 4)
-        core.tick(quarter / 4)
+        sail(first, path, quarter / 4)
+        first.tick(quarter / 4)
         if quarter < 4 * 32:
-            core.poll(quarter / 4)
+            first.poll(quarter / 4)
     sent = []
     for k in range(4):
-        sent.append(core.poll(32.0))
-        core.recorder.journal.commit()
+        sent.append(first.poll(32.0))
+        first.recorder.journal.commit()
         shutil.copytree(tmp_path / "undisturbed", tmp_path / f"dead behind {k}")
     assert len({frame for frame in sent if frame is not None}) == 3
     for k in range(4):
         again = follower(tmp_path / f"dead behind {k}")
         assert [again.poll(32.0) for _ in sent] == sent
-        assert again.counters == core.counters
+        assert again.core.counters == first.core.counters
+
+
+def test_epoch_that_a_follower_began_by_itself_is_not_begun_again(tmp_path: Path) -> None:
+    path = line(0.0, 60.0)
+
+    def follower() -> JournaledFollower:
+        journal = Journal(tmp_path, Owner(vehicle=1, fingerprint="test"), JournalSettings())
+        settings, slots = FollowerSettings(compression=QUICK), Slots(SlotSettings())
+        return JournaledFollower(journal, 1, start(path), settings=settings, slots=slots)
+
+    torn = follower()
+    for time_s in (0.25, 0.5, 300.0, 300.25, 300.5):
+        sail(torn, path, time_s, sonar_on=False)
+        torn.tick(time_s)
+        torn.poll(time_s)
+    assert torn.core.boot_epoch == 1
+    torn.recorder.journal.close()
+    assert follower().core.boot_epoch == 1
+    for file in tmp_path.glob("*.sqlite*"):
+        file.unlink()
+    assert follower().core.boot_epoch == 2
 
 
 def test_ping_reads_back_within_float32_and_then_exactly() -> None:
@@ -248,7 +269,8 @@ def test_checkpoint_that_cannot_be_read_starts_the_vehicle_anew(tmp_path: Path) 
     journal.close()
     never = Fate(np.random.default_rng(0), 0, 1.0)
     node = board(settings, follower, never, tmp_path, SensorTape(follower.steps()))
-    assert node.core.boot_epoch == 1
+    assert isinstance(node.core, JournaledFollower)
+    assert node.core.core.boot_epoch == 1
     assert node.core.status()["store_set_aside"] == 1
     for k in range(20):
         node.tick(0.25 * k)

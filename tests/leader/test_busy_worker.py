@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from firmware.journal import Journal, JournalSettings, Owner
+from firmware.journaled import bare
 from firmware.leader.atlas import Atlas
 from firmware.leader.closures import Closure
 from firmware.leader.core import LeaderCore
@@ -48,14 +49,15 @@ class SlowWorker:
         """Nothing is at work."""
 
 
-def surveyed(core: LeaderCore, until_s: float) -> list[float]:
+def surveyed(driven: LeaderCore | JournaledLeader, until_s: float) -> list[float]:
     """Sail with a slow worker; return the times up to which the past was composed."""
-    worker, composed_s = SlowWorker(), [core.composed_s]
+    core, worker = bare(driven), SlowWorker()
+    composed_s = [core.composed_s]
     water = Water(WaterSettings(), np.random.default_rng(1), lambda *_: (0.0, 0.0, 10.0))
-    loop = LeaderLoop(core, LoopbackMedium(water).modem(0), iter(()), worker, lambda: 0.0)
+    loop = LeaderLoop(driven, LoopbackMedium(water).modem(0), iter(()), worker, lambda: 0.0)
     for quarter in range(1, round(4 * until_s) + 1):
         worker.now_s = quarter / 4.0
-        sail(core, PATH, worker.now_s)
+        sail(driven, PATH, worker.now_s)
         loop.step(worker.now_s)
         if core.composed_s != composed_s[-1]:
             composed_s.append(core.composed_s)
@@ -100,16 +102,16 @@ def test_leader_that_waits_to_compose_resumes_as_it_stood(tmp_path: Path, until_
     dead.recorder.journal._close()
     resumed = journaled(tmp_path)
     assert resumed.recorder.journal.counters["store_resumed"] == 1
-    assert not resumed.has_jobs
+    assert not resumed.core.has_jobs
     cut_short = resumed.next_jobs()
     assert cut_short is not None
-    findings, stood_s = cut_short.run(), resumed.composed_s
-    for core in (dead, resumed):
-        assert core.composed_s == stood_s
-        core.finish(cut_short, findings, until_s)
-        assert core.next_jobs() is None
-        core.tick(until_s + 0.25)
-        assert core.composed_s > stood_s
-        assert core.has_jobs
-    ours_m, theirs_m = (core.trajectory(0).position_m for core in (resumed, dead))
+    findings, stood_s = cut_short.run(), resumed.core.composed_s
+    for leader in (dead, resumed):
+        assert leader.core.composed_s == stood_s
+        leader.finish(cut_short, findings, until_s)
+        assert leader.next_jobs() is None
+        leader.tick(until_s + 0.25)
+        assert leader.core.composed_s > stood_s
+        assert leader.core.has_jobs
+    ours_m, theirs_m = (leader.core.trajectory(0).position_m for leader in (resumed, dead))
     np.testing.assert_array_equal(ours_m, theirs_m)

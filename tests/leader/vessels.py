@@ -15,6 +15,7 @@ from firmware.leader.core import LeaderCore
 from firmware.leader.settings import LeaderSettings
 from firmware.soundings import Odometry, Ping
 from firmware.submap_builder import SubmapSettings
+from firmware.vehicle_core import Navigator
 from protocol.codec import decode, encode
 from protocol.packets import Header, Packet, Profile, TrajectoryPacket
 from protocol.schedule import Slots, SlotSettings
@@ -36,9 +37,7 @@ def seabed_m(north_m: np.ndarray, east_m: np.ndarray) -> np.ndarray:
     )
 
 
-def sail(
-    core: FollowerCore | LeaderCore, path: Path, time_s: float, *, sonar_on: bool = True
-) -> None:
+def sail(core: Navigator, path: Path, time_s: float, *, sonar_on: bool = True) -> None:
     """Feed one quarter second of navigation and, if asked, a ping."""
     north_m, east_m = path(time_s)
     before_m = path(time_s - 0.25)

@@ -11,7 +11,7 @@ import pytest
 from firmware.belief import Belief
 from firmware.dead_reckoning import ReckonedState
 from firmware.leader.atlas import SheetId, sheet_of
-from firmware.leader.core import LeaderCore
+from firmware.leader.journaled import JournaledLeader
 from firmware.submaps import GriddedSubmap, Track
 from host_tools.processes import vehicle
 from host_tools.processes.process_group import ProcessGroup
@@ -141,10 +141,10 @@ def test_what_lies_on_the_shelf_of_a_store_is_in_the_record(
     def sail_and_shelve(aboard: Aboard, ticks: Iterator[float], *, on_wall: bool) -> None:
         sail(aboard, ticks, on_wall=on_wall)
         core = aboard.loop.core
-        assert isinstance(core, LeaderCore)
+        assert isinstance(core, JournaledLeader)
         assert sheet is not None
-        core.atlas.add(sheet)
-        core.atlas.shelve(sheet.id)
+        core.core.atlas.add(sheet)
+        core.core.atlas.shelve(sheet.id)
 
     monkeypatch.setattr(vehicle, "_sail", sail_and_shelve)
     ending = threading.Thread(target=group.end, daemon=True)

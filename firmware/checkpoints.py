@@ -1,4 +1,4 @@
-"""A core written down whole, for stores: pickled, and read back with our own classes only."""
+"""What a store holds whole, such as a core: pickled, and read back with our own classes only."""
 
 import io
 import pickle
@@ -24,40 +24,40 @@ class NotNowError(Exception):
     """The core is in the middle of work that cannot be written down."""
 
 
-def written(core: object, marks: tuple[object, ...]) -> bytes:
-    """Return a core and its recorder's marks as bytes.
+def written(whole: object, marks: tuple[object, ...]) -> bytes:
+    """Return a core, or what matches found, and marks as bytes; numbers read back exactly.
 
     Raises
     ------
     NotNowError
-        While the core holds an iterator, such as a fit at work.
+        While a core holds an iterator, such as a fit at work.
     """
     try:
-        return pickle.dumps((core, marks), protocol=5)
+        return pickle.dumps((whole, marks), protocol=5)
     except TypeError as error:
         raise NotNowError(str(error)) from error
 
 
 def read(body: bytes, kind: type[T]) -> tuple[T, tuple[Any, ...]]:
-    """Return the core, of its kind, and the marks of bytes.
+    """Return what was written, of its kind, and the marks.
 
     Raises
     ------
     StoreUnusableError
-        For bytes that are no checkpoint of this program.
+        For bytes that this program has not written.
     """
     try:
-        core, marks = _Reader(io.BytesIO(body)).load()
+        whole, marks = _Reader(io.BytesIO(body)).load()
         marks = tuple(marks)
     except Exception as error:  # a damaged pickle may raise anything
-        raise StoreUnusableError(f"its checkpoint cannot be read: {error}") from error
-    if not isinstance(core, kind):
-        raise StoreUnusableError(f"its checkpoint is of a {type(core).__name__}")
-    return core, marks
+        raise StoreUnusableError(f"a {kind.__name__} in it cannot be read: {error}") from error
+    if not isinstance(whole, kind):
+        raise StoreUnusableError(f"a {kind.__name__} in it is a {type(whole).__name__}")
+    return whole, marks
 
 
 class _Reader(pickle.Unpickler):
-    """Reads our own classes and numpy's arrays; nothing else can be named in a checkpoint."""
+    """Reads our own classes and numpy's arrays; nothing else can be named in a store."""
 
     def find_class(self, module: str, name: str) -> Any:  # noqa: ANN401
         if (module, name) in _OTHERS:
@@ -66,4 +66,4 @@ class _Reader(pickle.Unpickler):
             found = super().find_class(module, name)
             if isinstance(found, type) and found.__module__ == module:
                 return found
-        raise pickle.UnpicklingError(f"{module}.{name} has no place in a checkpoint")
+        raise pickle.UnpicklingError(f"{module}.{name} has no place in a store")

@@ -5,26 +5,16 @@ Whenever the graph was composed, the core itself is written down and only what c
 replayed; ISAM2, which is not written, has just been built from the ledger, and is so built again.
 """
 
-import dataclasses
-import json
-import struct
-from typing import Any
-
-import numpy as np
-
 from firmware.belief import Belief
-from firmware.checkpoints import NotNowError
+from firmware.checkpoints import NotNowError, read, written
 from firmware.dead_reckoning import ReckonedState
 from firmware.inputs import Kind
 from firmware.journal import Journal
 from firmware.journaled import Journaled
 from firmware.leader.core import LeaderCore
 from firmware.leader.match_jobs import Findings, SheetJobs
-from firmware.leader.matches import Hint, Match, MatchOutcome, NoMatch
 from firmware.leader.settings import LeaderSettings
 from protocol.schedule import Slots
-
-_NOW = struct.Struct("<d")
 
 
 class JournaledLeader(Journaled[LeaderCore]):
@@ -68,9 +58,9 @@ class JournaledLeader(Journaled[LeaderCore]):
 
     def finish(self, done: SheetJobs, findings: Findings, now_s: float) -> None:
         """Record what the matches found, and judge it as a replay will."""
-        body = from_findings(findings, now_s)
+        body = written(findings, (now_s,))
         self.recorder.note(Kind.OUTCOMES, body)
-        self.core.finish(done, to_findings(body)[0], now_s)
+        self.core.finish(done, read(body, Findings)[0], now_s)
 
     def belief(self) -> Belief:
         """Return where the leader believes itself to be; asking may settle the graph."""
@@ -89,47 +79,7 @@ class JournaledLeader(Journaled[LeaderCore]):
                 jobs = self.core.next_jobs()
                 self._unfinished = [] if jobs is None else [jobs]
             case Kind.OUTCOMES:
-                findings, now_s = to_findings(body)
+                findings, (now_s,) = read(body, Findings)
                 self.core.finish(self._unfinished.pop(), findings, now_s)
             case _:
                 super()._replay(kind, body)
-
-
-def from_findings(findings: Findings, now_s: float) -> bytes:
-    """Return findings and the time of their judgement as bytes; numbers read back exactly."""
-    rows = [
-        (_columns(o.match), _columns(o.hint), None if o.reason is None else o.reason.name)
-        for o in findings.outcomes
-    ]
-    plain = (rows, findings.false_closures)
-    return _NOW.pack(now_s) + json.dumps(plain, separators=(",", ":")).encode()
-
-
-def to_findings(body: bytes) -> tuple[Findings, float]:
-    """Return the findings and the time of bytes."""
-    (now_s,) = _NOW.unpack_from(body)
-    outcomes = []
-    rows, false_closures = json.loads(body[_NOW.size :])
-    for found, hint, reason in rows:
-        outcomes.append(
-            MatchOutcome(
-                match=None if found is None else Match(**_values(found)),
-                reason=None if reason is None else NoMatch[reason],
-                hint=None if hint is None else Hint(**_values(hint)),
-            )
-        )
-    return Findings(outcomes=outcomes, false_closures=false_closures), now_s
-
-
-def _columns(found: Match | Hint | None) -> dict[str, object] | None:
-    if found is None:
-        return None
-    return {field.name: _plain(getattr(found, field.name)) for field in dataclasses.fields(found)}
-
-
-def _values(columns: dict[str, Any]) -> dict[str, Any]:
-    return {k: np.array(v) if isinstance(v, list) else v for k, v in columns.items()}
-
-
-def _plain(value: object) -> object:
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value

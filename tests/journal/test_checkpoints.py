@@ -68,7 +68,7 @@ def test_checkpoint_can_call_nothing(module: str, name: str) -> None:
 
 
 def test_checkpoint_of_another_core_is_none() -> None:
-    with pytest.raises(StoreUnusableError, match="of a Counter"):
+    with pytest.raises(StoreUnusableError, match="a deque in it is a Counter"):
         read(written(Counter(a=1), ()), deque)
 
 

@@ -5,11 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from firmware.checkpoints import read, written
 from firmware.follower.journaled import JournaledFollower
 from firmware.follower.settings import FollowerSettings
 from firmware.inputs import fan_of, from_ping, to_odometry, to_ping
 from firmware.journal import Journal, JournalSettings, Owner
-from firmware.leader.journaled import JournaledLeader, from_findings, to_findings
+from firmware.leader.journaled import JournaledLeader
 from firmware.leader.match_jobs import Findings
 from firmware.leader.matches import Hint, Match, MatchOutcome, NoMatch
 from firmware.soundings import Ping
@@ -245,18 +246,18 @@ def test_outcomes_read_back_exactly() -> None:
     hint = Hint(shift_m=np.array([0.1, -3.0]), covariance_m2=np.eye(2) / 3)
     outcomes.append(MatchOutcome(match=None, reason=NoMatch.AMBIGUOUS, hint=hint))
     findings = Findings(outcomes=outcomes, false_closures=[3, 141])
-    found_again, now_s = to_findings(from_findings(findings, 0.1 + 0.2))
-    read = found_again.outcomes
+    found_again, (now_s,) = read(written(findings, (0.1 + 0.2,)), Findings)
+    again = found_again.outcomes
     assert found_again.false_closures == [3, 141]
     assert now_s == 0.1 + 0.2
-    assert [o.reason for o in read] == [o.reason for o in outcomes]
-    assert read[0].match is not None
-    assert read[0].match.variance_m2 == np.inf
-    np.testing.assert_array_equal(read[0].match.covariance_m2, found.covariance_m2)
-    np.testing.assert_array_equal(read[0].match.shift_m, found.shift_m)
-    assert read[-1].hint is not None
-    np.testing.assert_array_equal(read[-1].hint.covariance_m2, hint.covariance_m2)
-    np.testing.assert_array_equal(read[-1].hint.shift_m, hint.shift_m)
+    assert [o.reason for o in again] == [o.reason for o in outcomes]
+    assert again[0].match is not None
+    assert again[0].match.variance_m2 == np.inf
+    np.testing.assert_array_equal(again[0].match.covariance_m2, found.covariance_m2)
+    np.testing.assert_array_equal(again[0].match.shift_m, found.shift_m)
+    assert again[-1].hint is not None
+    np.testing.assert_array_equal(again[-1].hint.covariance_m2, hint.covariance_m2)
+    np.testing.assert_array_equal(again[-1].hint.shift_m, hint.shift_m)
 
 
 def test_checkpoint_that_cannot_be_read_starts_the_vehicle_anew(tmp_path: Path) -> None:

@@ -5,6 +5,8 @@ Whenever the graph was composed, the core itself is written down and only what c
 replayed; ISAM2, which is not written, has just been built from the ledger, and is so built again.
 """
 
+import logging
+
 from firmware.belief import Belief
 from firmware.checkpoints import NotNowError, read, written
 from firmware.dead_reckoning import ReckonedState
@@ -13,8 +15,11 @@ from firmware.journal import Journal
 from firmware.journaled import Journaled
 from firmware.leader.core import LeaderCore
 from firmware.leader.match_jobs import Findings, SheetJobs
+from firmware.leader.matches import MatchOutcome, NoMatch
 from firmware.leader.settings import LeaderSettings
 from protocol.schedule import Slots
+
+LOG = logging.getLogger(__name__)
 
 
 class JournaledLeader(Journaled[LeaderCore]):
@@ -57,10 +62,21 @@ class JournaledLeader(Journaled[LeaderCore]):
         return self.core.next_jobs()
 
     def finish(self, done: SheetJobs, findings: Findings, now_s: float) -> None:
-        """Record what the matches found, and judge it as a replay will."""
-        body = written(findings, (now_s,))
+        """Record what the matches found, and judge it as a replay will.
+
+        Where it cannot be recorded all of them have failed.
+        """
+        try:
+            body = written(findings, (now_s,))
+            findings, _ = read(body, Findings)
+        except Exception:
+            LOG.exception("what the matches of %s found cannot be recorded", done.sheet.id)
+            self.recorder.journal.counters["store_outcomes_refused"] += 1
+            failed = MatchOutcome(match=None, reason=NoMatch.RAISED)
+            findings = Findings(outcomes=[failed] * len(done.jobs))
+            body = written(findings, (now_s,))
         self.recorder.note(Kind.OUTCOMES, body)
-        self.core.finish(done, read(body, Findings)[0], now_s)
+        self.core.finish(done, findings, now_s)
 
     def belief(self) -> Belief:
         """Return where the leader believes itself to be; asking may settle the graph."""

@@ -1,6 +1,7 @@
 """Matches that are never done in time, or not judged: the leader composes its past all the same."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from firmware.leader.closures import Closure
 from firmware.leader.core import LeaderCore
 from firmware.leader.journaled import JournaledLeader
 from firmware.leader.loop import LeaderLoop
-from firmware.leader.match_jobs import SheetJobs
+from firmware.leader.match_jobs import Findings, SheetJobs
 from firmware.leader.pose_graph import PoseGraph
 from firmware.leader.settings import LeaderSettings
 from firmware.leader.worker import Finished
@@ -92,6 +93,23 @@ def test_judgement_that_fails_once_starves_neither_matches_nor_composition(
     assert len(surveyed(leader, 300.0)) >= 4
     assert not failures
     assert leader.counters["submaps_unmatched"] == 0
+
+
+@pytest.mark.parametrize("odd", [(k for k in ""), object()], ids=["unwritable", "unreadable"])
+def test_findings_that_no_store_holds_starve_neither_matches_nor_composition(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, odd: Any
+) -> None:
+    found = Findings(outcomes=[], false_closures=[odd])
+    monkeypatch.setattr(SheetJobs, "run", lambda _: found)
+    leader = journaled(tmp_path)
+    assert len(surveyed(leader, 300.0)) >= 4
+    assert leader.status()["store_outcomes_refused"] > 4
+    assert leader.core.counters["submaps_unmatched"] == 0
+    leader.recorder.journal.commit()
+    leader.recorder.journal._close()
+    resumed = journaled(tmp_path)
+    assert resumed.core.counters == leader.core.counters
+    assert resumed.recorder.journal.counters == {"store_resumed": 1}
 
 
 @pytest.mark.parametrize("until_s", [81.0, 143.0])

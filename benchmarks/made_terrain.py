@@ -38,6 +38,13 @@ def straight_waves() -> Array:
     return -30.0 + _waves(60.0)
 
 
+def gullies() -> Array:
+    """Return the elevation of straight gullies, 5 m deep, down a slope of 3 %."""
+    east_m, north_m = _positions()
+    across_m = 2.5 * np.cos(2.0 * np.pi * east_m / 120.0)
+    return -60.0 + 0.03 * north_m + across_m + relief(3.0, 0.1, seed=27)
+
+
 def sand_waves() -> Array:
     """Return the elevation of sand waves of uneven height on faint relief."""
     uneven = 1.0 + 0.2 * relief(4.0, 1.0, seed=15)
@@ -48,6 +55,7 @@ KINDS: dict[str, Callable[[], Array]] = {
     "ridge": ridge,
     "canyon": canyon,
     "straight-waves": straight_waves,
+    "gullies": gullies,
     "sand-waves": sand_waves,
 }
 

@@ -16,7 +16,7 @@ from firmware.leader.estimate import Estimate
 from firmware.leader.matches import MatchingSettings, MatchOutcome, NoMatch
 from firmware.leader.matching import match
 from firmware.leader.nonconvexity import Doubt
-from firmware.leader.offsets import Offset, correction_of, corrections, offsets_of
+from firmware.leader.offsets import Offset, anchor_of, correction_of, corrections, offsets_of
 from firmware.leader.pairing import Calibrations, Side, side_of, strain_m
 from firmware.submaps import GriddedSubmap
 
@@ -162,9 +162,13 @@ def jobs_again(
 
 
 def _without_hint(offset: Offset, sheet: Sheet, hint: int, estimate: Estimate) -> Offset:
+    """Return an offset as if its hint had not been told; the ways to the nodes stay as they are."""
     other, told = offset.origin, estimate.closure(hint)
     reckoned_m = sheet.reckoned_at(sheet.time_s) - other.reckoned_at(other.time_s)
-    return offset.without(told.offset_m - reckoned_m, told.covariance_m2)
+    apart_m2 = sum(anchor_of(end, estimate).apart_m2 for end in (sheet, other))
+    between = dataclasses.replace(offset, covariance_m2=offset.covariance_m2 - apart_m2)
+    left = between.without(told.offset_m - reckoned_m, told.covariance_m2)
+    return dataclasses.replace(left, covariance_m2=left.covariance_m2 + apart_m2)
 
 
 def _ranked(

@@ -119,7 +119,7 @@ class PoseGraph(Estimate):
         """Doubt the way on from a vehicle's newest node, since its clock was set back.
 
         Once the clock has caught up with that node it tells of less time than may have passed: the
-        way is as unsure as dead reckoning for as long, as if navigation had been lost.
+        way becomes as unsure as dead reckoning for as long, as if navigation were lost meanwhile.
         """
         chain, s = self._chains[chain_id], self._settings
         passed_m2 = reckoned_m2(

@@ -201,7 +201,7 @@ def ridge_of(
     the line is weighted by the prior itself. turned_rad is the sigma of how far what is not known
     of drift turns the one sub-map against the other.
     """
-    misfit = surface.residual_m2 / surface.noise_m2
+    misfit = surface.misfit
     row, column = np.nonzero(np.isfinite(misfit) & (misfit <= limit))
     if row.size < _LEAST_RIDGE:
         return Ridge(axis=axis, sigma_rad=math.hypot(_UNTRACED_RAD, turned_rad), strayed_m2=0.0)

@@ -19,7 +19,7 @@ _LONGEST_SIGMAS = np.pi  # of the prior: the longest wave that tells its shifts 
 _PROFILE_SIGMAS = 0.25  # of a region, between shifts that are held side by side
 _MOST_BINS = 160  # of a profile, however far it reaches
 _LEAST_SHARE = 1e-6  # of the prior's variance that a region has left, for its own scale
-_CONTRADICTION = 2.0  # nats of misfit that end a region, where it is
+_CONTRADICTION = 2.0  # nats against a shift, beyond which a region does not go on there
 _DATUM_FLOOR_M = 0.1  # of a depth offset: slopes and decoding shift the mean of an overlap
 _ASKEW_RAD = 0.03  # sigma of the axis of a hint along one only
 _UNLIKE = 0.1  # of the misfit of unrelated seabed: drift makes so much of the relief itself
@@ -89,11 +89,11 @@ def _contradicted(problem: PairProblem, surface: ErrorSurface, relief: Relief) -
     Misfit grows with the overlap wherever drift bends what is compared: it has to be a good part of
     what unrelated seabed shows as well, lest it end a ridge that goes on.
     """
-    error = surface.residual_m2 / surface.noise_m2
-    least = float(error.min())
+    least = float(surface.misfit.min())
     unlike = least + _UNLIKE * max(relief.background - least, 0.0)
-    misfit = ambiguity.misfit_of(surface, relief.noise_scale, problem.correlated_cells)
-    return np.asarray((misfit >= _CONTRADICTION) & (error >= unlike))[np.isfinite(misfit)]
+    against = ambiguity.misfit_of(surface, relief.noise_scale, problem.correlated_cells)
+    contradicted = (against >= _CONTRADICTION) & (surface.misfit >= unlike)
+    return np.asarray(contradicted[np.isfinite(against)])
 
 
 def _is_closed(along: Array, across: Array, contradicted: NDArray[np.bool_]) -> bool:
@@ -123,10 +123,9 @@ def _cautious(problem: PairProblem, surface: ErrorSurface, relief: Relief, prior
     Waves longer than what the prior leaves open look alike at all of its shifts: that they fit
     would confirm the prior, whatever it says.
     """
-    misfit = surface.residual_m2 / surface.noise_m2
     is_own = not (problem.reference.reconstructed or problem.query.reconstructed)
     least = _WARPED_NOISE if is_own else ambiguity.LEAST_MISFIT
-    scale = max(_TOLERANCE * float(misfit.min()), least)
+    scale = max(_TOLERANCE * float(surface.misfit.min()), least)
     return replace(
         relief,
         noise_scale=scale,

@@ -160,7 +160,7 @@ def _log_ratio(
     way to the background, -N I as far beyond.
     """
     usable = np.isfinite(surface.residual_m2)
-    misfit = np.where(usable, surface.residual_m2 / surface.noise_m2, 1.0) / tolerated
+    misfit = np.where(usable, surface.misfit, 1.0) / tolerated
     level = relief.background / tolerated
     half_way = min(np.log(pivot), 0.5 * np.log(level))
     share = 1.0 - np.log(np.maximum(misfit, 1.0)) / half_way

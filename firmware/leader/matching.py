@@ -106,7 +106,7 @@ def _search(
     scores = [value + c.log_prior for c, value in zip(candidates, refined, strict=True)]
     best = int(np.argmax(scores))
     found = ambiguity.posterior(surface, evidence, prior, null_share)
-    least = float(np.min(surface.residual_m2 / surface.noise_m2))  # on the lattice, beside it
+    least = float(surface.misfit.min())  # on the lattice, beside it
     ridge = surface, ambiguity.tolerated_misfit(least, independent)
     return _decide(candidates[best], refined[best], found, prior, problem, ridge)
 

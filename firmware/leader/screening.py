@@ -56,6 +56,11 @@ class ErrorSurface:
     noise_m2: Array
     depth_offset_m: Array
 
+    @property
+    def misfit(self) -> Array:
+        """E in units of the noise, inf where there is no overlap; (K, L)."""
+        return self.residual_m2 / self.noise_m2
+
     def window(self, north: slice, east: slice) -> "ErrorSurface":
         """Return a rectangle of it."""
         return ErrorSurface(

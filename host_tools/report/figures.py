@@ -169,8 +169,10 @@ def closures(result: MissionResult, evaluation: Evaluation) -> Figure:
 
 
 def _strip(axes: Axes, closures: Sequence[JudgedClosure]) -> None:
-    groups = {stage: [c for c in closures if c.closure.stage == stage] for stage in STAGES}
-    groups["active"] = [c for c in closures if c.closure.active_at_end]
+    groups: dict[str, list[JudgedClosure]] = {stage: [] for stage in (*STAGES, "active")}
+    for judged in closures:
+        last = "active" if judged.closure.active_at_end else judged.closure.stage
+        groups[last].append(judged)
     for k, members in enumerate(groups.values()):
         spread = np.linspace(-0.3, 0.3, max(len(members), 1))[: len(members)]
         errors_m = np.clip([c.error_m for c in members], 0.05, 500.0)

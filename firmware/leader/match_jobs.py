@@ -16,7 +16,7 @@ from firmware.leader.estimate import Estimate
 from firmware.leader.matches import MatchingSettings, MatchOutcome, NoMatch
 from firmware.leader.matching import match
 from firmware.leader.nonconvexity import Doubt
-from firmware.leader.offsets import Offset, anchor_of, correction_of, corrections, offsets_of
+from firmware.leader.offsets import Offset, correction_of, corrections, offsets_of
 from firmware.leader.pairing import Calibrations, Side, side_of, strain_m
 from firmware.submaps import GriddedSubmap
 
@@ -165,10 +165,7 @@ def _without_hint(offset: Offset, sheet: Sheet, hint: int, estimate: Estimate) -
     """Return an offset as if its hint had not been told; the ways to the nodes stay as they are."""
     other, told = offset.origin, estimate.closure(hint)
     reckoned_m = sheet.reckoned_at(sheet.time_s) - other.reckoned_at(other.time_s)
-    apart_m2 = sum(anchor_of(end, estimate).apart_m2 for end in (sheet, other))
-    between = dataclasses.replace(offset, covariance_m2=offset.covariance_m2 - apart_m2)
-    left = between.without(told.offset_m - reckoned_m, told.covariance_m2)
-    return dataclasses.replace(left, covariance_m2=left.covariance_m2 + apart_m2)
+    return offset.without(told.offset_m - reckoned_m, told.covariance_m2)
 
 
 def _ranked(
@@ -204,7 +201,7 @@ def _worth_trying(ranked: list[Offset], settings: ClosureSettings) -> list[Offse
     """Return the first of the ranked pairs, few of them with an offset known already."""
     chosen, known = [], 0
     for offset in ranked:
-        is_known = offset.sigma_m <= settings.known_sigma_m
+        is_known = offset.open_sigma_m <= settings.known_sigma_m
         known += is_known
         if not is_known or known <= settings.known_pairs_per_submap:
             chosen.append(offset)

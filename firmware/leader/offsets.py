@@ -22,31 +22,43 @@ class Offset:
     """The offset of a sheet from another one, the origin, as the estimate has it.
 
     shift_m (2,) is to be added to the offset by dead reckoning, each sheet's at its own time;
-    covariance_m2 (2, 2) is that of the offset. drifts are those at the nodes of both.
+    covariance_m2 (2, 2) is that of the offset, of which apart_m2 is the part that lies within the
+    composed past: estimated once and for all. drifts are those at the nodes of both.
     """
 
     origin: Sheet
     shift_m: Array
     covariance_m2: Array
+    apart_m2: Array
     drifts: Drifts
 
     @property
     def sigma_m(self) -> float:
         """How well it is known in its worst direction."""
-        return float(np.sqrt(max(np.linalg.eigvalsh(self.covariance_m2)[-1], 0.0)))
+        return _worst_m(self.covariance_m2)
+
+    @property
+    def open_sigma_m(self) -> float:
+        """How much of that a match can still tell."""
+        return _worst_m(self.covariance_m2 - self.apart_m2)
 
     def without(self, told_m: Array, told_m2: Array) -> "Offset":
         """Return the offset with one of the Gaussian factors that it rests on taken out.
 
-        What the offset would tell of the drifts stays the same.
+        The factor joins what the graph still estimates. What the offset would tell of the drifts
+        stays the same.
         """
-        told, known = np.linalg.inv(told_m2), np.linalg.inv(self.covariance_m2)
+        told, known = np.linalg.inv(told_m2), np.linalg.inv(self.covariance_m2 - self.apart_m2)
         left_m2 = np.linalg.inv(known - told)
         return replace(
             self,
             shift_m=left_m2 @ (known @ self.shift_m - told @ told_m),
-            covariance_m2=left_m2,
+            covariance_m2=left_m2 + self.apart_m2,
         )
+
+
+def _worst_m(covariance_m2: Array) -> float:
+    return float(np.sqrt(max(np.linalg.eigvalsh(covariance_m2)[-1], 0.0)))
 
 
 def offsets_of(sheet: Sheet, others: list[Sheet], estimate: Estimate) -> list[Offset]:
@@ -74,6 +86,7 @@ def offsets_of(sheet: Sheet, others: list[Sheet], estimate: Estimate) -> list[Of
             origin=other,
             shift_m=moves_m[0] - moves_m[k],
             covariance_m2=covariances_m2[k - 1],
+            apart_m2=anchors[0].apart_m2 + anchors[k].apart_m2,
             drifts=Drifts(gain=gains[k - 1], left=left[k - 1]),
         )
         for k, other in enumerate(placed, start=1)

@@ -53,7 +53,7 @@ class Consistency:
     """The verdict on each closure, in the order given.
 
     believed (K,) is membership of the largest consistent set; partners (K,) the number of others
-    in that set whose loop with it could be tested and closes.
+    in that set whose loop with it could be tested and closes, and that saw something else.
     """
 
     believed: NDArray[np.bool_]
@@ -64,10 +64,12 @@ def consistent_set(
     closures: Sequence[CandidateClosure],
     odometry: RelativeOdometry,
     settings: ConsistencySettings,
+    alike: NDArray[np.bool_],
 ) -> Consistency:
     """Return which closures belong to the largest pairwise consistent set of their window.
 
-    Windows overlap by half; a closure is believed when one of its windows believes it.
+    Windows overlap by half; a closure is believed when one of its windows believes it. alike (K, K)
+    are pairs that rest on the same soundings: one error makes both, and they are no partners.
     """
     count = len(closures)
     believed = np.zeros(count, dtype=bool)
@@ -81,7 +83,8 @@ def consistent_set(
         members = largest_clique(agree, settings.seeds)
         chosen = np.zeros(window.size, dtype=bool)
         chosen[members] = True
-        support = (agree & known)[:, chosen].sum(axis=1)
+        vouches = agree & known & ~alike[np.ix_(window, window)]
+        support = vouches[:, chosen].sum(axis=1)
         partners[window] = np.maximum(partners[window], support)
         believed[window] |= chosen
     return Consistency(believed=believed, partners=partners)

@@ -1,8 +1,9 @@
 """Which gated closures to believe: the graph, other closures and the map are asked in turn.
 
 A closure is consistent when the graph already knew its offset to a few metres (then its gate was
-proof enough), when another closure closes a loop with it (pairwise consistency), or, unless it
-holds along one axis only, when the map that it would build agrees where the match did not look.
+proof enough), when another closure, of other soundings, closes a loop with it (pairwise
+consistency), or, unless it holds along one axis only, when the map that it would build agrees where
+the match did not look.
 This is our reading of the paper's MCM, identification of invalid closures by the consistency of the
 built map; its text is not public.
 What is not yet believed waits, and is asked again when more is known. An audit takes back closures
@@ -14,6 +15,7 @@ from collections import Counter, deque
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from firmware.geometry import Array
 from firmware.leader.atlas import Atlas, Sheet
@@ -31,6 +33,7 @@ from firmware.leader.pairing import Calibrations, side_of
 from firmware.leader.pose_graph import PoseGraph
 from protocol.settings import Settings, setting
 
+_SUBMAP_S = 40.0  # overlaps that lie nearer in time may share soundings
 _NEXT_S = (35.0, 90.0)
 """Neighbours share no soundings with the matched sub-map, and dead reckoning still holds."""
 
@@ -89,10 +92,12 @@ class Judgement:
                 doubtful.append(closure)
         candidates = [*self._waiting, *doubtful]
         if len(candidates) > 1:
+            odometry = _Odometry(candidates, graph, self._settings)
             found = consistent_set(
                 [_candidate(k, c) for k, c in enumerate(candidates)],
-                _Odometry(candidates, graph, self._settings),
+                odometry,
                 self._settings.pairwise,
+                odometry.alike(),
             )
             for k, closure in enumerate(candidates):
                 if found.believed[k] and found.partners[k] > 0:
@@ -255,6 +260,13 @@ class _Odometry:
         other = self._chain[first] != self._chain[second]
         offset_m[other], variance_m2[other] = np.nan, np.nan
         return offset_m, variance_m2[:, None, None] * np.eye(2)
+
+    def alike(self) -> NDArray[np.bool_]:
+        """Return which closures (K, K) share soundings at both ends, whichever way round."""
+        near = np.abs(self._time_s[:, None] - self._time_s) < _SUBMAP_S
+        near &= self._chain[:, None] == self._chain
+        straight = near[::2, ::2] & near[1::2, 1::2]
+        return np.asarray(straight | (near[::2, 1::2] & near[1::2, ::2]))
 
 
 def _candidate(position: int, closure: Closure) -> CandidateClosure:

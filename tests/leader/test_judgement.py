@@ -63,6 +63,20 @@ def test_true_closures_vouch_for_each_other_hours_into_a_turning_tide() -> None:
         assert all(closure.active for closure in pair), hour
 
 
+def test_closures_of_the_same_soundings_do_not_vouch_for_each_other() -> None:
+    """Own sub-maps overlap by half: what misleads the match of one misleads that of the next."""
+    graph, track = moored()
+    for apart_s, believed in ((20.0, False), (120.0, True)):
+        pair = [
+            closure_between(graph, track, 600.0, 7200.0 + k, np.array([60.0, 0.0]))
+            for k in (0.0, apart_s)
+        ]
+        for closure in pair:
+            closure.axis_deg = 0.0  # then the map beside it is not asked
+        Judgement(JudgementSettings(), MatchingSettings()).consider(pair, Atlas(10), graph)
+        assert [closure.active for closure in pair] == [believed, believed]
+
+
 def test_closures_that_contradict_dead_reckoning_do_not() -> None:
     graph, track = moored()
     offsets_m = np.zeros(2), np.array([60.0, 0.0])

@@ -4,6 +4,7 @@ import pytest
 from firmware.geometry import Array
 from firmware.leader.consistency import (
     CandidateClosure,
+    Consistency,
     ConsistencySettings,
     Keys,
     RelativeOdometry,
@@ -52,13 +53,21 @@ def closures_of(
     return [closures[k] for k in order], np.array(valid)[order]
 
 
+def judged(
+    closures: list[CandidateClosure], odometry: RelativeOdometry, settings: ConsistencySettings
+) -> Consistency:
+    """Return the verdict on closures that all rest on soundings of their own."""
+    alike = np.zeros((len(closures), len(closures)), dtype=bool)
+    return consistent_set(closures, odometry, settings, alike)
+
+
 @pytest.mark.parametrize("bad_share", [0.3, 0.5, 0.6])
 def test_false_closures_stay_outside_the_clique(bad_share: float) -> None:
     rng = np.random.default_rng(3)
     truth, odometry = survey(rng)
     bad = int(100 * bad_share)
     closures, valid = closures_of(truth, rng, 100 - bad, bad)
-    result = consistent_set(closures, odometry, SETTINGS)
+    result = judged(closures, odometry, SETTINGS)
     assert valid[result.believed].mean() > 0.95
     assert result.believed[valid].mean() > 0.75
     assert result.partners[result.believed].min() > 10
@@ -68,7 +77,7 @@ def test_three_windows_agree_with_one() -> None:
     rng = np.random.default_rng(4)
     truth, odometry = survey(rng)
     closures, valid = closures_of(truth, rng, 160, 80)
-    result = consistent_set(closures, odometry, ConsistencySettings(window=120))
+    result = judged(closures, odometry, ConsistencySettings(window=120))
     assert valid[result.believed].mean() > 0.95
     assert result.believed[valid].mean() > 0.75
 
@@ -84,16 +93,16 @@ def test_pairs_without_odometry_between_them_do_not_contradict() -> None:
     agree, known = agreement(closures, nothing, SETTINGS)
     assert not known.any()
     assert agree.sum() == 90
-    result = consistent_set(closures, nothing, SETTINGS)
+    result = judged(closures, nothing, SETTINGS)
     assert result.believed.all()
     assert not result.partners.any()
 
 
 def test_none_and_one_closure_are_consistent() -> None:
     truth, odometry = survey(np.random.default_rng(6))
-    assert consistent_set([], odometry, SETTINGS).believed.size == 0
+    assert judged([], odometry, SETTINGS).believed.size == 0
     closures, _ = closures_of(truth, np.random.default_rng(6), 1, 0)
-    assert consistent_set(closures, odometry, SETTINGS).believed.all()
+    assert judged(closures, odometry, SETTINGS).believed.all()
 
 
 def test_clique_is_the_largest_of_two_disjoint_ones() -> None:
@@ -113,4 +122,4 @@ def test_one_axis_closure_agrees_whatever_it_says_across() -> None:
         offset_m=truth[1, 9] - truth[0, 5] + [0.0, 50.0],
         covariance_m2=np.diag([0.5, 200.0**2]),
     )
-    assert consistent_set([*closures, wide], odometry, SETTINGS).believed[-1]
+    assert judged([*closures, wide], odometry, SETTINGS).believed[-1]

@@ -84,7 +84,7 @@ def main() -> None:
             first = line(bed, middle, 0.0, rng)
             second = line(bed, middle + rng.uniform(-30, 30, 2), np.pi / 2.0, rng)
             found = match(first[1], second[1], np.zeros(2), 100.0 * np.eye(2), matching).match
-            misfit = found.residual / found.variance_m2 if found else 1.0
+            misfit = found.misfit if found else 1.0
             angle, wrong_m = rng.uniform(0, 2 * np.pi), rng.uniform(8.0, 60.0)
             for shift, votes in (
                 (rng.normal(0.0, 0.7, 2), valid),

@@ -37,7 +37,7 @@ class Closure:
     offset_m: Array
     covariance_m2: Array
     residual: float
-    misfit: float  # residual over what the noise model predicts
+    misfit: float  # mean square over what the noise model predicts
     axis_deg: float | None
     origin_reckoned_m: Array  # (2,) raw dead reckoning at the anchors' times
     target_reckoned_m: Array
@@ -77,7 +77,7 @@ def closure_of(
         offset_m=ends_m[1] + found.shift_m - ends_m[0] + aside_m,
         covariance_m2=found.covariance_m2 + aside_m2,
         residual=found.residual,
-        misfit=found.residual / found.variance_m2,
+        misfit=found.misfit,
         axis_deg=found.axis_deg,
         origin_reckoned_m=job.origin.reckoned_at(found.reference_time_s),
         target_reckoned_m=job.target.reckoned_at(found.query_time_s),

@@ -79,8 +79,8 @@ def vote(
 ) -> Vote:
     """Return the vote of the windows on a closure.
 
-    matched_misfit is E over the noise model where the closure itself was matched
-    (`Match.residual / Match.variance_m2`): its neighbours should fit about as well.
+    matched_misfit is that of the closure's own match (`Match.misfit`): its neighbours should fit
+    about as well.
     """
     tolerated = settings.tolerance * float(np.clip(matched_misfit, *_MISFIT_RANGE))
     ratios = [_ratio(window, settings, tolerated) for window in windows]

@@ -127,15 +127,16 @@ class Match:
     The shift holds between reference_time_s and query_time_s, the mean times at which the two
     measured the overlap. covariance_m2 (2, 2) is the measurement's own, without the prior. axis_deg
     is None, or the direction from north in which a one-axis closure holds; across it the covariance
-    is wide. centre_m (2,) is the overlap's middle in the reference's coordinates.
+    is wide. centre_m (2,) is the overlap's middle in the reference's coordinates. residual is the E
+    that was judged; misfit the mean square over what the noise model predicts.
     """
 
     shift_m: Array
     covariance_m2: Array
     residual: float
+    misfit: float
     overlap_cells: int
     axis_deg: float | None
-    variance_m2: float
     centre_m: Array
     reference_time_s: float
     query_time_s: float

@@ -216,14 +216,16 @@ def _decide(
     among the repetitions of a pattern: such a pair counts as ambiguous.
     """
     settings, refined = problem.settings, measure(winner.field, problem.noise)
-    residual, _, _ = problem.error_at(refined.shift_m, absolute=settings.residual == "absolute")
-    limit = settings.residual_noise_ratio * refined.variance_m2
+    square_m2, _, _ = problem.error_at(refined.shift_m, absolute=False)
+    residual, limit = square_m2, settings.residual_noise_ratio * refined.variance_m2
     if settings.residual == "absolute":
+        residual, _, _ = problem.error_at(refined.shift_m, absolute=True)
         limit = np.sqrt(limit)
     if evidence < settings.evidence_limit:
         return _none(NoMatch.FEATURELESS)
     if residual > max(settings.residual_limit, limit):
         return _none(NoMatch.RESIDUAL)
+    misfit = square_m2 / refined.variance_m2
     covariance = refined.covariance_m2 * settings.covariance_scale
     values, vectors = np.linalg.eigh(covariance)
     sigmas = np.sqrt(values)
@@ -231,7 +233,7 @@ def _decide(
     certain = elsewhere.false_mass <= settings.false_mass_limit
     walk = np.eye(2) * refined.walk_m2
     if certain and sigmas[1] <= settings.sigma_limit_m:
-        return _closure(refined, residual, covariance + walk, None)
+        return _closure(refined, residual, misfit, covariance + walk, None)
     free_m = np.sqrt(vectors[:, 1] @ prior.covariance_m2 @ vectors[:, 1])
     if certain and min(sigmas[1] / 2.0, free_m) <= settings.basin_m:
         axis = vectors[:, 0]
@@ -248,19 +250,19 @@ def _decide(
         return _none(NoMatch.LOOSE)
     wide = along * np.outer(axis, axis) + _FREE_M**2 * np.outer(across, across)
     axis_deg = float(np.degrees(np.arctan2(axis[1], axis[0])) % 180.0)
-    return _closure(refined, residual, wide + walk, axis_deg)
+    return _closure(refined, residual, misfit, wide + walk, axis_deg)
 
 
 def _closure(
-    refined: Refined, residual: float, covariance_m2: Array, axis_deg: float | None
+    refined: Refined, residual: float, misfit: float, covariance_m2: Array, axis_deg: float | None
 ) -> MatchOutcome:
     found = Match(
         shift_m=refined.shift_m,
         covariance_m2=covariance_m2,
         residual=residual,
+        misfit=misfit,
         overlap_cells=refined.overlap_cells,
         axis_deg=axis_deg,
-        variance_m2=refined.variance_m2,
         centre_m=refined.centre_m,
         reference_time_s=refined.reference_time_s,
         query_time_s=refined.query_time_s,

@@ -147,6 +147,7 @@ class OpenPairs:
             self.settle(*pair)
             if hint is not None:
                 judgement.drop_hint(hint, graph)
+                self._forget_hint(hint)
         elif outcome.hint is not None and hint is None:
             ends = _ends_of(job)
             told = outcome.hint.repeated(self._heard(ends, graph))
@@ -155,6 +156,11 @@ class OpenPairs:
             self.note_hint(*pair, number)
             if number is not None:
                 self._hints.append(_Heard(number=number, ends=ends))
+
+    def _forget_hint(self, number: int) -> None:
+        """Let a hint that was dropped make those of its neighbours count for no less."""
+        others = (hint for hint in self._hints if hint.number != number)
+        self._hints = deque(others, maxlen=_HEARD)
 
     def _heard(self, ends: Ends, graph: PoseGraph) -> int:
         """Return how many hints of neighbours of a pair's sub-maps are believed."""

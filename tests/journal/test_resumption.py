@@ -236,7 +236,7 @@ def test_outcomes_read_back_exactly() -> None:
         residual=0.1,
         overlap_cells=int(np.int64(7)),
         axis_deg=None,
-        variance_m2=np.inf,
+        misfit=np.inf,
         centre_m=np.array([5.0, 6.0]),
         reference_time_s=3.0,
         query_time_s=4.0,
@@ -252,7 +252,7 @@ def test_outcomes_read_back_exactly() -> None:
     assert now_s == 0.1 + 0.2
     assert [o.reason for o in again] == [o.reason for o in outcomes]
     assert again[0].match is not None
-    assert again[0].match.variance_m2 == np.inf
+    assert again[0].match.misfit == np.inf
     np.testing.assert_array_equal(again[0].match.covariance_m2, found.covariance_m2)
     np.testing.assert_array_equal(again[0].match.shift_m, found.shift_m)
     assert again[-1].hint is not None

@@ -46,6 +46,18 @@ def test_shift_is_found_below_the_cell(scene: Scene) -> None:
     assert found.residual < 0.02
 
 
+def test_misfit_is_the_same_by_either_reading_of_the_residual(scene: Scene) -> None:
+    reference = scene.submap(200, 200, (41, 70))
+    query = scene.submap(180, 230, (70, 41), shift_m=(13.3, -21.7))
+    by_distance = dataclasses.replace(STILL, residual="absolute", residual_limit=0.2)
+    squared, absolute = (
+        matched(reference, query, np.zeros(2), 30.0, settings) for settings in (STILL, by_distance)
+    )
+    assert absolute.residual > 2.0 * squared.residual
+    assert absolute.misfit == squared.misfit
+    assert 0.3 < squared.misfit < 2.0
+
+
 def test_strip_of_39_m_is_enough(scene: Scene) -> None:
     reference = scene.submap(200, 100, (41, 70))
     query = scene.submap(210, 200, (41, 70), shift_m=(5.0, 8.0))

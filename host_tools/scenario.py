@@ -157,6 +157,8 @@ class ScenarioSettings(Settings):
 
     def check(self) -> None:
         """Raise ConfigError when values that are right alone do not fit together."""
+        if self.block_lines == 1:
+            raise ConfigError("block_lines is 1; give 0, or 2 or more: one line is no block")
         diameter_m = self.turn_diameter_m
         if self.line_spacing_m < diameter_m:
             raise ConfigError(

@@ -78,6 +78,12 @@ def test_toml_may_be_written_in_capitals(tmp_path: Path) -> None:
     assert load_scenario(str(path)).duration_min == 12
 
 
+def test_a_block_of_one_line_is_refused() -> None:
+    with pytest.raises(ConfigError, match="block_lines is 1; give 0, or 2 or more"):
+        replace(named_scenario("paper-1"), {"block_lines": 1}).check()
+    replace(named_scenario("paper-1"), {"block_lines": 2}).check()
+
+
 def test_unknown_scenario_names_the_choices() -> None:
     with pytest.raises(ConfigError, match="paper-1, paper-2, field-1, day-1"):
         load_scenario("papper-1")

@@ -113,8 +113,9 @@ def maps(result: MissionResult, evaluation: Evaluation) -> Figure:
     depth_m = evaluation.map_depth_m[part]
     shown = panels[0].imshow(depth_m, origin="lower", extent=extent, cmap="viridis_r")
     figure.colorbar(shown, ax=panels[0], label="depth in mission datum (m)", shrink=0.8)
-    shade = _hillshade(depth_m, window.cell_north_m, window.cell_east_m)
-    panels[0].imshow(shade, origin="lower", extent=extent, cmap="gray", alpha=0.35)
+    if min(depth_m.shape) > 1:  # one row or column has no slope
+        shade = _hillshade(depth_m, window.cell_north_m, window.cell_east_m)
+        panels[0].imshow(shade, origin="lower", extent=extent, cmap="gray", alpha=0.35)
     for vehicle in result.vehicles:
         panels[0].plot(vehicle.final_m[:, 1], vehicle.final_m[:, 0], color="white", lw=0.7)
     panels[0].set_title("map of the final estimate, final tracks")

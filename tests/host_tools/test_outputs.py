@@ -16,6 +16,7 @@ from host_tools.evaluation import (
 )
 from host_tools.mapping import DepthMap
 from host_tools.report import write_report
+from host_tools.report.figures import maps
 from host_tools.results import MissionResult, SoundingPatch, VehicleResult
 from host_tools.scenario import ScenarioSettings, named_scenario
 from host_tools.simulator.placement import Site, place_survey
@@ -217,6 +218,17 @@ def test_report_is_one_file_that_needs_no_other(mission: MissionResult, tmp_path
     assert "rotation about the range is unobservable" in page
     assert "http" not in page.replace("http-equiv", "")
     assert not re.search(r"<(script|link)\b", page)
+
+
+@pytest.mark.parametrize("mapped", [np.s_[:1], np.s_[:, :1], np.s_[:1, :1]])
+def test_a_map_of_one_row_or_column_is_drawn(
+    mission: MissionResult, mapped: tuple[slice, ...]
+) -> None:
+    evaluation = evaluate(mission)
+    depth_m = np.full_like(evaluation.map_depth_m, np.nan)
+    depth_m[mapped] = 30.0
+    figure = maps(mission, dataclasses.replace(evaluation, map_depth_m=depth_m))
+    assert figure.axes[0].get_title() == "map of the final estimate, final tracks"
 
 
 def test_unwritable_output_is_a_clear_error(tmp_path: Path) -> None:

@@ -90,19 +90,17 @@ def replace(settings: T, changes: Mapping[str, object], prefer: str = "") -> T:
         For an unknown or ambiguous key, an unreadable value, or one out of bounds.
     """
     known = [key for key, *_ in flatten(settings)]
-    for name, value in changes.items():
-        settings = _replace_one(settings, _resolve(name, known, prefer), value)
-    return settings
+    return _replaced(settings, {_resolve(name, known, prefer): changes[name] for name in changes})
 
 
-def _resolve(name: str, known: list[str], prefer: str) -> list[str]:
+def _resolve(name: str, known: list[str], prefer: str) -> tuple[str, ...]:
     if name in known:
-        return name.split(".")
+        return tuple(name.split("."))
     matches = [key for key in known if key.endswith("." + name)]
     preferred = [key for key in matches if key.startswith(prefer + ".")]
     matches = preferred if len(preferred) == 1 else matches
     if len(matches) == 1:
-        return matches[0].split(".")
+        return tuple(matches[0].split("."))
     if matches:
         raise ConfigError(f"setting {name!r} is ambiguous; write one of {', '.join(matches)}")
     leaves = {key.rpartition(".")[2]: key for key in known}
@@ -111,13 +109,17 @@ def _resolve(name: str, known: list[str], prefer: str) -> list[str]:
     raise ConfigError(f"unknown setting {name!r}; {meant}`fathomlink config show` lists them all")
 
 
-def _replace_one(settings: T, path: list[str], value: object) -> T:
-    name, *rest = path
-    if rest:
-        changed: object = _replace_one(getattr(settings, name), rest, value)
-    else:
-        changed = _read(name, value, typing.get_type_hints(type(settings))[name])
-    return dataclasses.replace(settings, **{name: changed})
+def _replaced(settings: T, changes: Mapping[tuple[str, ...], object]) -> T:
+    """Return settings with all changes by path at once, since some are right only together."""
+    kinds = typing.get_type_hints(type(settings))
+    fresh: dict[str, object] = {}
+    for name in {path[0]: None for path in changes}:
+        below = {path[1:]: value for path, value in changes.items() if path[0] == name}
+        if () in below:
+            fresh[name] = _read(name, below[()], kinds[name])
+        else:
+            fresh[name] = _replaced(getattr(settings, name), below)
+    return dataclasses.replace(settings, **fresh)
 
 
 def _read(name: str, value: object, kind: Any) -> object:  # noqa: ANN401

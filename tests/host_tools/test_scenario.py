@@ -2,6 +2,7 @@ from pathlib import Path
 
 import pytest
 
+from host_tools.mission_settings import MissionSettings
 from host_tools.scenario import SCENARIOS, load_scenario, named_scenario
 from protocol.errors import ConfigError
 from protocol.settings import replace
@@ -96,3 +97,26 @@ def test_unknown_scenario_names_the_choices() -> None:
 def test_setting_survey_position_as_text_pairs_both() -> None:
     changed = replace(named_scenario("paper-1"), {"loss": "0.3", "survey_north_m": "none"})
     assert (changed.water.loss, changed.survey_north_m) == (0.3, None)
+
+
+@pytest.mark.parametrize(
+    "pair",
+    [
+        {"leader.graph.node_interval_s": 7, "leader.graph.alike_interval_s": 70},
+        {"slots.leader_period_s": 10, "slots.leader_offsets_s": "2"},
+    ],
+)
+def test_settings_that_are_right_together_may_be_given_in_any_order(
+    pair: dict[str, object],
+) -> None:
+    other_way = dict(reversed(pair.items()))
+    settings = MissionSettings()
+    assert replace(settings, pair) == replace(settings, other_way) != settings
+    first = next(iter(pair))
+    with pytest.raises(ConfigError, match=first.rpartition(".")[2][:6]):
+        replace(settings, {first: pair[first]})
+
+
+def test_of_two_names_of_one_setting_the_last_given_counts() -> None:
+    settings = replace(MissionSettings(), {"scenario.water.loss": 0.2, "loss": 0.3})
+    assert settings.scenario.water.loss == 0.3

@@ -69,15 +69,15 @@ def advice_lines(counters: Mapping[str, float]) -> Iterator[str]:
 
 def _counters(folder: Path) -> dict[str, Mapping[str, float]]:
     """Return counters by vehicle: of a finished mission, or of processes that run or have died."""
-    summary, processes = folder / "summary.json", folder / FOLDER
-    if summary.exists() and not processes.exists():
+    summary, processes = folder / "summary.json", sorted((folder / FOLDER).glob("*.json"))
+    if summary.exists() and not processes:
         counters = _json(summary).get("counters", {})
         if not isinstance(counters, dict) or not all(
             isinstance(v, dict) for v in counters.values()
         ):
             raise ConfigError(f"{summary} holds no counters; give the folder of a mission")
         return counters
-    return {path.stem: _json(path) for path in sorted(processes.glob("*.json"))}
+    return {path.stem: _json(path) for path in processes}
 
 
 def _json(path: Path) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from host_tools.results import MissionResult
 from host_tools.simulator.placement import place_survey
 from host_tools.simulator.terrain import open_terrain
 from host_tools.stored_nodes import close_stores
-from host_tools.writers import prepare_folder, write_outputs
+from host_tools.writers import forget_mission, prepare_folder, write_outputs
 from protocol.acoustics import Delivery
 
 
@@ -31,11 +31,17 @@ def simulate(
     baseline: str = "none",
     progress: Progress | None = None,
     store: Path | None = None,
+    out: Path | None = None,
 ) -> MissionResult:
-    """Return a whole mission, all vehicles in this process; they keep stores if asked to."""
+    """Return a whole mission, all vehicles in this process; they keep stores if asked to.
+
+    What an earlier one left in out is removed once this one can begin.
+    """
     check_air(settings)
     scenario = settings.scenario
     site = place_survey(open_terrain(terrain, scenario.relief_seed), scenario, seed)
+    if out is not None:
+        forget_mission(out, terrain)
     truth_map = DepthMap(site.window)
     vehicles = simulated_vehicles(settings, site, seed, truth_map.add)
     leader, followers = local_nodes(settings, vehicles, baseline, store)
@@ -120,6 +126,7 @@ def _run(arguments: argparse.Namespace) -> None:
             arguments.baseline,
             lambda now_s: advance(bar, now_s),
             arguments.store,
+            folder,
         )
     evaluation = evaluate(result)
     write_outputs(result, evaluation, folder)

@@ -13,13 +13,17 @@ from scipy.spatial.transform import Rotation
 
 from firmware.geometry import Array
 from host_tools.evaluation import Evaluation, JudgedClosure, as_plain, closure_counts
+from host_tools.processes.records import VehicleFiles
 from host_tools.results import MissionResult, VehicleResult
 from host_tools.simulator.placement import Site
 from host_tools.simulator.seabed import Datum
 from protocol.acoustics import Delivery
 from protocol.errors import ConfigError
+from protocol.vehicles import VEHICLES, name_of
 
 NODATA = -9999.0
+FILES = ("report.html", "summary.json", "closures.csv", "air.jsonl", "map.tif", "map_truth.tif")
+TRACKS = ("truth", "dead_reckoning", "live", "final")
 CLOSURE_COLUMNS = (
     "t_s,from_vehicle,from_submap,to_vehicle,to_submap,measured_north_m,measured_east_m,"
     "true_north_m,true_east_m,residual,stage,active_at_end,sigma_north_m,sigma_east_m,axis_deg,"
@@ -48,6 +52,26 @@ def prepare_folder(folder: Path) -> Path:
     return folder
 
 
+def forget_mission(folder: Path, terrain: Path | None) -> None:
+    """Remove what an earlier mission left, by the names of the contract, but no terrain of now.
+
+    Raises
+    ------
+    ConfigError
+        When it cannot be removed.
+    """
+    names = [f"{name_of(vehicle)}_{track}.tum" for vehicle in range(VEHICLES) for track in TRACKS]
+    kept = None if terrain is None else terrain.resolve()
+    try:
+        for path in (folder / name for name in (*FILES, *names)):
+            if path.resolve() != kept:
+                path.unlink(missing_ok=True)
+        for vehicle in range(VEHICLES):
+            VehicleFiles(folder, vehicle).forget()
+    except OSError as error:
+        raise ConfigError(f"cannot write to --out {folder}: {error}") from error
+
+
 def write_outputs(result: MissionResult, evaluation: Evaluation, folder: Path) -> None:
     """Write every file of the contract but report.html."""
     prepare_folder(folder)
@@ -68,13 +92,13 @@ def write_trajectories(vehicle: VehicleResult, datum: Datum, folder: Path) -> No
     true_attitude = np.stack([truth.yaw_rad, truth.pitch_rad, truth.roll_rad], axis=1)
     measured = np.zeros_like(true_attitude)
     measured[:, 0] = vehicle.yaw_rad
-    tracks = {
-        "truth": (np.stack([truth.north_m, truth.east_m], axis=1), true_attitude),
-        "dead_reckoning": (vehicle.dead_reckoning_m, measured),
-        "live": (vehicle.live_m, measured),
-        "final": (vehicle.final_m, measured),
-    }
-    for kind, (position_m, attitude_rad) in tracks.items():
+    tracks = (
+        (np.stack([truth.north_m, truth.east_m], axis=1), true_attitude),
+        (vehicle.dead_reckoning_m, measured),
+        (vehicle.live_m, measured),
+        (vehicle.final_m, measured),
+    )
+    for kind, (position_m, attitude_rad) in zip(TRACKS, tracks, strict=True):
         rows = np.column_stack(
             [
                 truth.time_s,

@@ -24,7 +24,7 @@ from host_tools.report import write_report
 from host_tools.results import MissionResult
 from host_tools.simulate import advance, outcome_lines
 from host_tools.simulator.vehicle import SimulatedVehicle
-from host_tools.writers import prepare_folder, write_air, write_outputs
+from host_tools.writers import forget_mission, prepare_folder, write_air, write_outputs
 from protocol.acoustics import Delivery
 
 Ready = Callable[[ProcessGroup], None]
@@ -49,9 +49,7 @@ def host_mission(
     check_frames(modems, voyage.settings)
     vehicles = simulated_vehicles(voyage.settings, voyage.site, voyage.seed)
     water = water_between(voyage.settings, vehicles, voyage.seed)
-    files = {vehicle: VehicleFiles(out, vehicle) for vehicle in water.nodes}
-    for each in files.values():
-        each.forget()
+    forget_mission(out, voyage.site.raster.path)
     deliveries: list[Delivery] = []
     emulated = None if modems == "raw" else EmulatedModems(modems, water, deliveries.append)
     paced = progress if pace is None else pace.after(progress)

@@ -55,7 +55,7 @@ class VehicleFiles:
 
     def forget(self) -> None:
         """Remove what an earlier mission left."""
-        for suffix in ("starts", "beliefs", "json", "soundings.npz", "npz"):
+        for suffix in ("starts", "beliefs", "json", "soundings.npz", "npz", "log"):
             self._path(suffix).unlink(missing_ok=True)
 
     def note(self, belief: Belief, reckoned: ReckonedState) -> None:

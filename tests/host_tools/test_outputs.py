@@ -22,7 +22,13 @@ from host_tools.scenario import ScenarioSettings, named_scenario
 from host_tools.simulator.placement import Site, place_survey
 from host_tools.simulator.terrain import open_terrain
 from host_tools.simulator.vehicle import SimulatedVehicle
-from host_tools.writers import body_quaternions, prepare_folder, write_map, write_outputs
+from host_tools.writers import (
+    body_quaternions,
+    forget_mission,
+    prepare_folder,
+    write_map,
+    write_outputs,
+)
 from protocol.acoustics import Delivery
 from protocol.errors import ConfigError
 from protocol.settings import replace
@@ -218,6 +224,20 @@ def test_report_is_one_file_that_needs_no_other(mission: MissionResult, tmp_path
     assert "rotation about the range is unobservable" in page
     assert "http" not in page.replace("http-equiv", "")
     assert not re.search(r"<(script|link)\b", page)
+
+
+def test_an_earlier_mission_is_removed_by_name_and_nothing_else(tmp_path: Path) -> None:
+    (tmp_path / "processes").mkdir()
+    left = ("report.html", "follower_2_live.tum", "processes/leader.log", "processes/leader.json")
+    others = ("map.tif", "notes.txt", "follower_2.sqlite", "live.tum", "processes/notes.txt")
+    for name in (*left, *others):
+        (tmp_path / name).write_text("")
+    forget_mission(tmp_path, terrain=tmp_path / "processes" / ".." / "map.tif")
+    assert not any((tmp_path / name).exists() for name in left)
+    assert all((tmp_path / name).exists() for name in others)
+    (tmp_path / "report.html").mkdir()
+    with pytest.raises(ConfigError, match="cannot write to --out"):
+        forget_mission(tmp_path, None)
 
 
 @pytest.mark.parametrize("mapped", [np.s_[:1], np.s_[:, :1], np.s_[:1, :1]])

@@ -33,6 +33,25 @@ def test_same_seed_writes_the_same_air_byte_for_byte(
         assert np.isfinite(rows).all()
 
 
+def test_a_folder_that_is_used_again_tells_of_the_new_mission_only(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "processes").mkdir()
+    (tmp_path / "processes" / "leader.json").write_text('{"modem_sent": 12345}')
+    for old in ("report.html", "follower_2_final.tum"):
+        (tmp_path / old).write_text("old")
+    assert simulate(tmp_path, "--no-report", "--set", "leg_m=9000", "--set", "duration_min=90") == 2
+    assert (tmp_path / "report.html").exists()  # a mission that cannot begin removes nothing
+    assert simulate(tmp_path, "--no-report") == 0
+    assert not (tmp_path / "report.html").exists()
+    assert not (tmp_path / "follower_2_final.tum").exists()
+    capsys.readouterr()
+    assert main(["link", "status", str(tmp_path)]) == 0
+    shown = capsys.readouterr().out
+    assert "frames" in shown
+    assert "12345" not in shown
+
+
 @pytest.mark.parametrize("ping_hz", ["0.5", "2.5"])
 def test_pings_at_any_rate_leave_answers_and_outputs_on_whole_seconds(
     tmp_path: Path, ping_hz: str

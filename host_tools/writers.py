@@ -3,6 +3,7 @@
 import csv
 import importlib.metadata
 import json
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -238,22 +239,25 @@ def summarise(result: MissionResult, evaluation: Evaluation) -> dict[str, object
 
 
 def link_counts(deliveries: Sequence[Delivery]) -> dict[str, object]:
-    """Return frames sent, receptions by fate, and bytes on the air, in all and by source."""
-    fates: dict[str, int] = {}
-    sent: dict[tuple[int, float], int] = {}
-    for delivery in deliveries:
-        fates[delivery.fate] = fates.get(delivery.fate, 0) + 1
-        sent[(delivery.source, delivery.t_tx_s)] = len(delivery.frame)
+    """Return frames sent and bytes on the air, in all and by source, and receptions by fate.
+
+    A frame is expected once at each receiver; packets_lost says how often it did not come whole.
+    """
+    fates = Counter(delivery.fate for delivery in deliveries)
+    sent = dict.fromkeys(
+        (d.source, d.t_tx_s, d.frame if d.sent is None else d.sent) for d in deliveries
+    )
     by_source: dict[str, dict[str, int]] = {}
-    for (source, _), size in sent.items():
+    for source, _, frame in sent:
         entry = by_source.setdefault(str(source), {"packets_sent": 0, "bytes_on_air": 0})
         entry["packets_sent"] += 1
-        entry["bytes_on_air"] += size
-    received = fates.get("delivered", 0) + fates.get("duplicate", 0)
+        entry["bytes_on_air"] += len(frame)
+    expected = fates.total() - fates["duplicate"]
     return {
         "packets_sent": len(sent),
-        "packets_lost": sum(fates.values()) - received,
-        "bytes_on_air": sum(sent.values()),
+        "packets_lost": expected - fates["delivered"],
+        "receptions_expected": expected,
+        "bytes_on_air": sum(len(frame) for *_, frame in sent),
         "receptions": dict(sorted(fates.items())),
         "sources": by_source,
     }

@@ -139,6 +139,7 @@ def _wait(condition: Callable[[], bool]) -> None:
 def _each_frame(delivery: Delivery, record: Callable[[Delivery], None]) -> None:
     """Record a packet of whole 256-byte frames frame by frame, anything else as it is."""
     size = FRAMES_AND_BYTES[4][1]
-    frames = [delivery.frame[k : k + size] for k in range(0, len(delivery.frame), size)]
-    for frame in frames:
-        record(replace(delivery, frame=frame))
+    whole = delivery.frame if delivery.sent is None else delivery.sent
+    for k in range(0, len(whole), size):
+        part = slice(k, k + size)
+        record(replace(delivery, frame=delivery.frame[part], sent=whole[part]))

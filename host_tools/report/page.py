@@ -159,7 +159,7 @@ def _link_text(result: MissionResult) -> str:
     counts = link_counts(result.deliveries)
     return (
         f"<p>{counts['packets_sent']} frames, {counts['bytes_on_air']} bytes on the air; "
-        f"{counts['packets_lost']} receptions failed.</p>"
+        f"{counts['packets_lost']} of {counts['receptions_expected']} receptions failed.</p>"
     )
 
 

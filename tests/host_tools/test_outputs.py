@@ -25,6 +25,7 @@ from host_tools.simulator.vehicle import SimulatedVehicle
 from host_tools.writers import (
     body_quaternions,
     forget_mission,
+    link_counts,
     prepare_folder,
     write_map,
     write_outputs,
@@ -238,6 +239,32 @@ def test_an_earlier_mission_is_removed_by_name_and_nothing_else(tmp_path: Path) 
     (tmp_path / "report.html").mkdir()
     with pytest.raises(ConfigError, match="cannot write to --out"):
         forget_mission(tmp_path, None)
+
+
+def test_frames_are_counted_once_and_losses_at_each_receiver() -> None:
+    packet = [bytes([k]) * 256 for k in (1, 2)]  # two frames that are sent together
+    heard = [
+        Delivery(
+            source=1,
+            destination=destination,
+            t_tx_s=8.0,
+            t_rx_s=8.2,
+            t_delivered_s=11.0,
+            frame=bytes(256) if fate == "corrupt" else frame,
+            fate=fate,
+            sent=frame,
+        )
+        for frame in packet
+        for destination, fate in ((0, "delivered"), (2, "corrupt"), (2, "duplicate"), (3, "lost"))
+    ]
+    answer = dataclasses.replace(delivery(20.0), source=0, frame=bytes(22))
+    counts = link_counts([*heard, answer])
+    assert (counts["packets_sent"], counts["bytes_on_air"]) == (3, 2 * 256 + 22)
+    assert (counts["packets_lost"], counts["receptions_expected"]) == (4, 7)
+    assert counts["sources"] == {
+        "1": {"packets_sent": 2, "bytes_on_air": 512},
+        "0": {"packets_sent": 1, "bytes_on_air": 22},
+    }
 
 
 @pytest.mark.parametrize("mapped", [np.s_[:1], np.s_[:, :1], np.s_[:1, :1]])

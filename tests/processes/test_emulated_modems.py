@@ -12,7 +12,9 @@ from firmware.follower.settings import FollowerSettings
 from firmware.ports import ModemPort
 from firmware.soundings import Odometry
 from host_tools.cli import main
-from protocol.acoustics import Water, WaterSettings
+from host_tools.processes.emulated_modems import _each_frame
+from host_tools.writers import link_counts
+from protocol.acoustics import Delivery, Water, WaterSettings
 from protocol.codec import decode
 from protocol.modems.loopback import LoopbackMedium
 from protocol.schedule import Slots, SlotSettings
@@ -71,6 +73,27 @@ def test_a_follower_has_as_many_frames_for_a_slot_as_it_holds() -> None:
     assert core.status()["slots_missed"] == 1
     headers = [decode(frame).header for three in frames for frame in three if frame is not None]
     assert [header.tx_second for header in headers] == [0, 0, 8, 8, 8, 8]
+
+
+def test_a_packet_of_two_frames_is_recorded_as_both_and_as_they_were_sent() -> None:
+    sent, heard = bytes([1]) * 256 + bytes([2]) * 256, bytes([1]) * 256 + bytes([3]) * 256
+    packet = Delivery(
+        source=1,
+        destination=0,
+        t_tx_s=8.0,
+        t_rx_s=8.2,
+        t_delivered_s=11.0,
+        frame=heard,
+        fate="corrupt",
+        sent=sent,
+    )
+    recorded: list[Delivery] = []
+    _each_frame(packet, recorded.append)
+    assert [(d.frame, d.sent) for d in recorded] == [
+        (heard[:256], sent[:256]),
+        (heard[256:], sent[256:]),
+    ]
+    assert link_counts(recorded)["bytes_on_air"] == 512
 
 
 @pytest.mark.slow

@@ -207,6 +207,7 @@ def summarise(result: MissionResult, evaluation: Evaluation) -> dict[str, object
         "terrain": {
             "name": site.raster.name,
             "path": None if site.raster.path is None else str(site.raster.path),
+            "stored_as": "depths" if site.raster.positive_down else "elevations",
             "cell_north_m": site.raster.cell_north_m,
             "cell_east_m": site.raster.cell_east_m,
             "share_of_survey_with_data": site.data_share,

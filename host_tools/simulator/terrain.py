@@ -20,6 +20,8 @@ BUILT_IN_EPSG = 32631
 BUILT_IN_CELL_M = 5.0
 BUILT_IN_CELLS = 600
 COARSE_CELLS = 4_000_000
+LEAST_OTHER_SIGN_SHARE = 0.1
+"""Of a grid that is mostly above zero: with more below it, it may be sea beside higher land."""
 FILLS = (-9999, 9999, -32768, -32767, 32767, -99999, 99999, -999999)
 """Stored where nothing was measured: believed of files that declare no such value themselves."""
 
@@ -30,7 +32,7 @@ class Raster:
 
     `read` may be asked for any window; `coarse_m` (R, C) is the whole grid thinned for planning,
     NaN where there is no data. remarks say what was taken for no data though the file does not
-    call it so.
+    call it so, and that stored depths were turned over.
     """
 
     name: str
@@ -71,12 +73,13 @@ class Raster:
 def open_terrain(path: Path | None, relief_seed: int = 1) -> Raster:
     """Return the raster of a file, or the built-in relief when there is none.
 
-    A grid whose median is above zero is taken to hold depths, positive down.
+    A grid whose median is above zero is taken to hold depths, positive down, and that is told.
 
     Raises
     ------
     ConfigError
-        When the file is not a raster, has no projected system in metres, or holds no data.
+        When the file is not a raster, has no projected system in metres, or holds no data; when
+        it may hold depths as well as elevations of more land than sea.
     """
     if path is None:
         return _built_in(relief_seed)
@@ -89,8 +92,7 @@ def open_terrain(path: Path | None, relief_seed: int = 1) -> Raster:
             shape = (max(1, dataset.height // step), max(1, dataset.width // step))
             stored = dataset.read(1, masked=True, out_shape=shape)
             values = _values(dataset, stored)
-            believable = np.abs(values) <= DEEPEST_M
-            positive_down = bool(believable.any() and np.median(values[believable]) > 0.0)
+            positive_down = _holds_depths(path, values[np.abs(values) <= DEEPEST_M])
             elevation_m = _elevations(values, positive_down)
             known = np.isfinite(elevation_m)
             if not known.any():
@@ -104,7 +106,7 @@ def open_terrain(path: Path | None, relief_seed: int = 1) -> Raster:
                 columns=dataset.width,
                 coarse_m=elevation_m,
                 positive_down=positive_down,
-                remarks=_remarks(path.name, stored, known),
+                remarks=_remarks(path.name, stored, known, positive_down=positive_down),
             )
     except RasterioError as error:
         raise ConfigError(f"terrain {path} cannot be read as a raster: {error}") from error
@@ -139,14 +141,32 @@ def _elevations(values: NDArray[np.float64], positive_down: bool) -> NDArray[np.
     return elevation_m
 
 
-def _remarks(name: str, stored: np.ma.MaskedArray, known: NDArray[np.bool_]) -> tuple[str, ...]:
-    """Return one remark on cells that were taken for no data untold, if there are any."""
+def _holds_depths(path: Path, values: NDArray[np.float64]) -> bool:
+    """Return whether believable values (N,) are depths, positive down: most lie above zero."""
+    if values.size == 0 or np.median(values) <= 0.0:
+        return False
+    below = float(np.mean(values < 0.0))
+    if below > LEAST_OTHER_SIGN_SHARE:
+        raise ConfigError(
+            f"terrain {path} holds {below:.0%} of its cells below zero, and most above: depths, or "
+            "elevations of more land than sea? declare the land as no-data, or cut it off"
+        )
+    return True
+
+
+def _remarks(
+    name: str, stored: np.ma.MaskedArray, known: NDArray[np.bool_], *, positive_down: bool
+) -> tuple[str, ...]:
+    """Return remarks on depths, and on cells that were taken for no data untold, if there are."""
+    turned = f"terrain {name}: most cells lie above zero: they are read as depths, positive down"
+    remarks = (turned,) if positive_down else ()
     untold = np.ma.filled(np.isfinite(stored), False) & ~known
     if not untold.any():
-        return ()
+        return remarks
     low, high = stored.data[untold].min(), stored.data[untold].max()
     held = f"{low:g}" if low == high else f"{low:g} to {high:g}"
     return (
+        *remarks,
         f"terrain {name}: {untold.mean():.1%} of its cells hold values ({held}) that no seabed "
         "has, and are taken as unknown; declare them as no-data (gdal_edit.py -a_nodata)",
     )

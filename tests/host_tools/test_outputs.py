@@ -152,6 +152,7 @@ def test_outputs_are_those_of_the_contract(mission: MissionResult, tmp_path: Pat
     assert summary["vehicles"]["follower_1"]["live"]["share_of_dead_reckoning"] == pytest.approx(
         0.5
     )
+    assert summary["terrain"]["stored_as"] == "elevations"
     assert summary["datum"]["shift_m"] == mission.site.datum.depth_shift_m
 
 

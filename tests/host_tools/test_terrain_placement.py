@@ -95,6 +95,18 @@ def test_depths_stored_positive_down_are_turned_over(tmp_path: Path) -> None:
     up = place_survey(open_terrain(write_raster(tmp_path / "u.tif", slope())), PAPER, 1)
     down = place_survey(open_terrain(write_raster(tmp_path / "d.tif", -slope())), PAPER, 1)
     np.testing.assert_array_equal(up.seabed.depth_m, down.seabed.depth_m)
+    assert up.raster.remarks == ()
+    assert "d.tif: most cells lie above zero: they are read as depths" in down.raster.remarks[0]
+
+
+def test_elevations_of_more_land_than_sea_are_refused_rather_than_turned_over(
+    tmp_path: Path,
+) -> None:
+    elevation_m = slope() + 28.0  # from 8 m above the sea to 4 m under it
+    assert 0.1 < (elevation_m < 0.0).mean() < 0.5
+    path = write_raster(tmp_path / "a.tif", elevation_m)
+    with pytest.raises(ConfigError, match=r"a.tif holds 22% of its cells below zero, and most"):
+        open_terrain(path)
 
 
 @pytest.mark.parametrize("up", [1.0, -1.0])
@@ -109,7 +121,7 @@ def test_scale_and_offset_of_the_band_make_metres(tmp_path: Path, up: float) -> 
     scaled = open_terrain(path)
     np.testing.assert_allclose(scaled.coarse_m, metres.coarse_m, atol=1e-4)
     np.testing.assert_allclose(scaled.read(10, 20, 30, 40), metres.read(10, 20, 30, 40), atol=1e-4)
-    assert scaled.remarks == ()
+    assert len(scaled.remarks) == (0 if up > 0.0 else 1)
 
 
 @pytest.mark.parametrize("up", [1.0, -1.0])
@@ -120,13 +132,14 @@ def test_a_fill_that_is_not_declared_is_no_seabed_and_is_told(
     elevation_m = slope()
     elevation_m[40:60] = np.nan
     stored = up * elevation_m
-    stored[150:200, 100:] = fill = up * 250.0 if isinstance(fill, str) else fill
+    stored[150:180, 100:] = fill = up * 250.0 if isinstance(fill, str) else fill
     terrain = open_terrain(write_raster(tmp_path / "a.tif", stored, nodata=None))
-    elevation_m[150:200, 100:] = np.nan
+    elevation_m[150:180, 100:] = np.nan
     np.testing.assert_array_equal(terrain.coarse_m, elevation_m.astype(np.float32))
     np.testing.assert_array_equal(terrain.read(0, 0, 300, 300), elevation_m.astype(np.float32))
-    (remark,) = terrain.remarks
-    assert f"a.tif: 11.1% of its cells hold values ({fill:g}" in remark
+    remark = terrain.remarks[-1]
+    assert len(terrain.remarks) == (1 if up > 0.0 else 2)
+    assert f"a.tif: 6.7% of its cells hold values ({fill:g}" in remark
 
 
 def test_a_fill_stored_in_other_units_is_no_seabed_either(tmp_path: Path) -> None:

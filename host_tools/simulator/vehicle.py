@@ -50,7 +50,7 @@ class SimulatedVehicle:
     """Vehicle `index` (0: the leader) of a scenario; a function of scenario, seabed and seed.
 
     `on_soundings`, if given, is called chunk by chunk with the measured soundings (N, 3) placed by
-    true position: north, east, depth. Fliers are left out. It feeds the evaluation's truth map.
+    the true poses: north, east, depth. Fliers are left out. It feeds the evaluation's truth map.
     """
 
     def __init__(
@@ -206,15 +206,7 @@ class SimulatedVehicle:
         ranges_m[at], fliers[at] = self._sonar.measure(pinged)
         if self._on_soundings is not None:
             used = ~fliers & (chunk.time_s <= self._survey_s)[:, None]
-            measured = Poses(
-                north_m=poses.north_m,
-                east_m=poses.east_m,
-                depth_m=chunk.depth_m,
-                roll_rad=chunk.roll_rad,
-                pitch_rad=chunk.pitch_rad,
-                yaw_rad=chunk.yaw_rad,
-            )
-            self._on_soundings(self._sonar.soundings(measured, np.where(used, ranges_m, np.nan)))
+            self._on_soundings(self._sonar.soundings(poses, np.where(used, ranges_m, np.nan)))
         return dataclasses.replace(chunk, ranges_m=ranges_m)
 
     def _poses(self, time_s: Array) -> Poses:

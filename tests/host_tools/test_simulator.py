@@ -91,6 +91,18 @@ def test_noise_free_soundings_lie_on_the_seabed() -> None:
         np.testing.assert_allclose(points_m[:, 2], expected_m, atol=0.01)
 
 
+def test_the_truth_map_has_none_of_the_errors_of_navigation() -> None:
+    errors = {"heading_bias_deg": 5, "depth_wander_m": 3, "sounding_sigma_m": 0}
+    changes = {"duration_min": 1, **errors, "sounding_sigma_share": 0}
+    scenario = replace(named_scenario("paper-1"), changes)
+    site = place_survey(open_terrain(None), scenario, 1)
+    truth_m: list[np.ndarray] = []
+    list(SimulatedVehicle(scenario, site.seabed, 0, 7, truth_m.append).steps())
+    points_m = np.concatenate(truth_m)
+    expected_m = site.seabed.depth_at(points_m[:, 0], points_m[:, 1])
+    np.testing.assert_allclose(points_m[:, 2], expected_m, atol=0.01)
+
+
 def test_noise_free_odometry_sums_to_the_true_track_through_turns() -> None:
     scenario = replace(named_scenario("paper-1"), {"duration_min": 12, **QUIET})
     site = place_survey(open_terrain(None), scenario, 1)

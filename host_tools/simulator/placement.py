@@ -235,6 +235,12 @@ def _window(raster: Raster, corner: tuple[float, float], box: Box) -> Window:
     right = math.ceil((corner[1] + box.east_m - west_m) / raster.cell_east_m)
     top = math.floor((top_m - corner[0] - box.north_m) / raster.cell_north_m)
     bottom = math.ceil((top_m - corner[0] - box.south_m) / raster.cell_north_m)
+    if min(bottom - top, raster.rows) < 2 or min(right - left, raster.columns) < 2:
+        raise ConfigError(
+            f"terrain {raster.name}: cells of {raster.cell_north_m:g} x {raster.cell_east_m:g} m "
+            f"are too coarse for a survey of {box.north_m - box.south_m:.0f} x "
+            f"{box.east_m - box.west_m:.0f} m (north x east)"
+        )
     top, left = max(top, 0), max(left, 0)
     bottom, right = min(bottom, raster.rows), min(right, raster.columns)
     if bottom - top < 2 or right - left < 2:

@@ -192,6 +192,12 @@ def test_terrain_too_small_names_both_sizes(tmp_path: Path) -> None:
         place_survey(open_terrain(path), PAPER, 1)
 
 
+def test_cells_as_large_as_the_survey_are_told_as_such(tmp_path: Path) -> None:
+    path = write_raster(tmp_path / "a.tif", slope(4, 4), cell_m=2000.0)
+    with pytest.raises(ConfigError, match=r"cells of 2000 x 2000 m are too coarse for a survey of"):
+        place_survey(open_terrain(path), PAPER, 1)
+
+
 def test_survey_off_the_terrain_is_a_clear_error(tmp_path: Path) -> None:
     chosen = replace(PAPER, {"survey_north_m": 0, "survey_east_m": 0})
     with pytest.raises(ConfigError, match="outside terrain"):

@@ -139,7 +139,7 @@ def result_of_record(
         truth_map=mission.truth_map,
         counters=counters,
         quantities=record.quantities,
-        remarks=[*mission.site.raster.remarks, *record.remarks],
+        remarks=[*mission.site.remarks, *record.remarks],
         settings={key: value for key, value, *_ in flatten(settings)},
     )
 

@@ -133,7 +133,7 @@ def _run(arguments: argparse.Namespace) -> None:
     took_s = time.perf_counter() - began_s
     if not arguments.no_report:
         write_report(result, evaluation, folder / "report.html")
-    print("\n".join(outcome_lines(evaluation)))
+    print("\n".join([*outcome_lines(evaluation), *result.site.remarks]))
     print(f"{settings.scenario.duration_s / took_s:.0f} x real time; outputs in {folder}")
 
 

@@ -122,13 +122,14 @@ def vehicle_command(group: ProcessGroup, node: RemoteNode, voyage: Voyage, out: 
 
 
 def finish(result: MissionResult, out: Path, *, report: bool = True) -> list[str]:
-    """Write everything of the contract; return the table of errors."""
+    """Write everything of the contract; return the table of errors, and what else to tell."""
     evaluation = evaluate(result)
     write_outputs(result, evaluation, out)
     if report:
         write_report(result, evaluation, out / "report.html")
     missing = missing_lines(result, out)
-    return [*outcome_lines(evaluation), *failure_lines(result, out), *missing]
+    said = [*result.site.remarks, *failure_lines(result, out), *missing]
+    return [*outcome_lines(evaluation), *said]
 
 
 def failure_lines(result: MissionResult, out: Path) -> list[str]:

@@ -76,6 +76,7 @@ class Site:
     minimum_altitude_m: float
     tracks: Box
     footprint: Box
+    remarks: tuple[str, ...] = ()
 
 
 def place_survey(raster: Raster, scenario: ScenarioSettings, seed: int) -> Site:
@@ -111,6 +112,7 @@ def place_survey(raster: Raster, scenario: ScenarioSettings, seed: int) -> Site:
     shift_m = scenario.vehicle_depth_m + max(
         scenario.altitude_m - mean_m, scenario.minimum_altitude_m - shallowest_m
     )
+    mean_altitude_m = mean_m + shift_m - scenario.vehicle_depth_m
     window = _window(raster, corner, footprint.grown(MARGIN_ALTITUDES * scenario.altitude_m))
     seabed = Seabed(
         shift_m - _read(raster, window),
@@ -132,10 +134,21 @@ def place_survey(raster: Raster, scenario: ScenarioSettings, seed: int) -> Site:
         raster=raster,
         window=window,
         data_share=share,
-        mean_altitude_m=mean_m + shift_m - scenario.vehicle_depth_m,
+        mean_altitude_m=mean_altitude_m,
         minimum_altitude_m=shallowest_m + shift_m - scenario.vehicle_depth_m,
         tracks=tracks,
         footprint=footprint,
+        remarks=(*raster.remarks, *_altitude_remarks(scenario, mean_altitude_m)),
+    )
+
+
+def _altitude_remarks(scenario: ScenarioSettings, mean_m: float) -> tuple[str, ...]:
+    """Return one remark where the lowest altitude decides, rather than the mean."""
+    if mean_m < scenario.altitude_m + 0.05:
+        return ()
+    return (
+        f"altitude_m is {scenario.altitude_m:g} m, but the survey is {mean_m:.1f} m above the "
+        f"seabed in the mean: minimum_altitude_m={scenario.minimum_altitude_m:g} decides",
     )
 
 

@@ -52,6 +52,15 @@ def test_a_folder_that_is_used_again_tells_of_the_new_mission_only(
     assert "12345" not in shown
 
 
+def test_a_lowest_altitude_that_decides_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert simulate(tmp_path, "--no-report", "--set", "altitude_m=5") == 0
+    said = "altitude_m is 5 m, but the survey is"
+    assert said in capsys.readouterr().out
+    assert said in json.loads((tmp_path / "summary.json").read_text())["remarks"][0]
+
+
 @pytest.mark.parametrize("ping_hz", ["0.5", "2.5"])
 def test_pings_at_any_rate_leave_answers_and_outputs_on_whole_seconds(
     tmp_path: Path, ping_hz: str

@@ -66,6 +66,7 @@ def test_mean_altitude_is_forty_metres(tmp_path: Path) -> None:
     )
     altitude_m = site.seabed.depth_at(north_m.ravel(), east_m.ravel()) - PAPER.vehicle_depth_m
     assert np.nanmean(altitude_m) == pytest.approx(40.0, abs=0.2)
+    assert site.remarks == ()
 
 
 def test_a_pinnacle_raises_the_mean_so_that_no_altitude_is_under_fifteen(tmp_path: Path) -> None:
@@ -75,6 +76,10 @@ def test_a_pinnacle_raises_the_mean_so_that_no_altitude_is_under_fifteen(tmp_pat
     site = place_survey(open_terrain(write_raster(tmp_path / "a.tif", elevation_m)), chosen, 1)
     assert site.minimum_altitude_m == pytest.approx(15.0)
     assert site.mean_altitude_m > 40.0
+    (remark,) = site.remarks
+    assert (
+        f"{site.mean_altitude_m:.1f} m above the seabed in the mean: minimum_altitude_m" in remark
+    )
 
 
 def test_survey_lies_where_the_settings_say(tmp_path: Path) -> None:

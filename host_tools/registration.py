@@ -31,10 +31,15 @@ class RegistrationError:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TileShifts:
-    """Horizontal shifts of tiles registered on the truth map; flat tiles cannot say theirs."""
+    """Horizontal shifts of tiles registered on the truth map.
+
+    Neither flat tiles, which cannot say theirs, nor those that fit best at `SEARCH_M` or beyond,
+    where the search ends, are among the tiles that median and 95 % are of.
+    """
 
     tiles: int
     flat_tiles: int
+    far_tiles: int
     median_m: float
     p95_m: float
 
@@ -64,7 +69,7 @@ def tile_shifts(
     """Return the shifts of 100 m tiles of a map that fit the truth map best, depth offset free."""
     rows = max(2, round(TILE_M / cell_north_m))
     columns = max(2, round(TILE_M / cell_east_m))
-    lengths, flat = [], 0
+    lengths, flat, far = [], 0, 0
     nearest = ndimage.distance_transform_edt(
         np.isnan(truth_m), return_distances=False, return_indices=True
     )
@@ -82,13 +87,17 @@ def tile_shifts(
             shift_m = tile.best_shift()
             if shift_m is None:
                 flat += 1
+            elif np.abs(shift_m).max() >= SEARCH_M:
+                far += 1
             else:
                 lengths.append(float(np.hypot(*shift_m)))
     if not lengths:
-        return TileShifts(tiles=0, flat_tiles=flat, median_m=float("nan"), p95_m=float("nan"))
+        nan = float("nan")
+        return TileShifts(tiles=0, flat_tiles=flat, far_tiles=far, median_m=nan, p95_m=nan)
     return TileShifts(
         tiles=len(lengths),
         flat_tiles=flat,
+        far_tiles=far,
         median_m=float(np.median(lengths)),
         p95_m=float(np.percentile(lengths, 95)),
     )

@@ -9,6 +9,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from host_tools.evaluation import Evaluation, TrajectoryErrors, closure_counts
+from host_tools.registration import SEARCH_M
 from host_tools.report import figures
 from host_tools.results import MissionResult
 from host_tools.writers import link_counts
@@ -126,7 +127,8 @@ def _map_text(evaluation: Evaluation) -> str:
         f"{error.mean_m:.3f} m, median {error.median_m:.3f} m, {error.share_under_half_m:.1%} "
         f"under 0.5 m, {error.share_under_1m:.1%} under 1 m ({error.cells} cells). "
         f"Horizontal shift of {tiles.tiles} tiles of 100 m: median {tiles.median_m:.2f} m, 95 % "
-        f"{tiles.p95_m:.2f} m; {tiles.flat_tiles} tiles are too flat to say.</p>"
+        f"{tiles.p95_m:.2f} m; {tiles.far_tiles} more are {SEARCH_M:.0f} m off or farther, "
+        f"{tiles.flat_tiles} too flat to say.</p>"
     )
 
 

@@ -156,8 +156,15 @@ def test_tile_shift_finds_how_far_a_map_is_off() -> None:
     tiles = tile_shifts(relief(north_m=4.0) + 0.5, relief(), 5.0, 5.0)
     assert tiles.tiles == 36
     assert tiles.median_m == pytest.approx(4.0, abs=0.4)
+    assert tiles.far_tiles == 0
     same = tile_shifts(relief(), relief(), 5.0, 5.0)
     assert same.p95_m == 0.0
+
+
+def test_tiles_farther_off_than_is_searched_are_counted_apart() -> None:
+    tiles = tile_shifts(relief(north_m=28.0), relief(), 5.0, 5.0)
+    assert (tiles.tiles, tiles.far_tiles) == (0, 36)
+    assert np.isnan(tiles.median_m)
 
 
 def test_tiles_of_a_flat_or_tilted_plane_do_not_claim_a_shift() -> None:

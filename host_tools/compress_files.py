@@ -35,6 +35,7 @@ from protocol.settings import replace
 _SOUNDINGS = ("north_m", "east_m", "depth_m", "time_s")
 _TRACK = ("track_time_s", "track_north_m", "track_east_m", "track_yaw_rad")
 _MOST_STATES = 40
+_STATE_S = 1.25  # that a state stands for, and a quarter by which it may be rounded
 _LATEST_S = 1e11  # three thousand years; UTC has 2e9
 _ANY_VARIANCE_M2 = 1e30
 _MOST_BYTES = 1 << 20  # of a file of frames: a sub-map has 2,560
@@ -77,7 +78,18 @@ def compress_file(
         f"{bins.soundings} soundings in {len(cells.count)} cells, {len(packets)} frames, "
         f"{len(data)} bytes; {bins.dropped_bad} bad and {bins.dropped_fliers} wild soundings "
         f"dropped; fit: {report.ended} after {report.evaluations} evaluations, "
-        f"{report.failed_factorisations} failed factorisations"
+        f"{report.failed_factorisations} failed factorisations{_late(columns[3], track)}"
+    )
+
+
+def _late(time_s: Array, track: Track) -> str:
+    """Return what to add where soundings (N,) were measured after the track's last state."""
+    late = int(np.count_nonzero(time_s > track.time_s[-1] + _STATE_S))
+    if not late:
+        return ""
+    return (
+        f"; {late} soundings are later than the track, of which a sub-map holds {_MOST_STATES} "
+        f"states: the last is {track.time_s[-1] - track.time_s[0]:.0f} s after the first"
     )
 
 

@@ -238,6 +238,27 @@ def test_times_that_are_none_are_refused(name: str, survey: Survey, tmp_path: Pa
         compress_file(tmp_path / "s.npz", tmp_path / "f.bin", "lattice")
 
 
+@pytest.mark.parametrize("states", [40, 60, None])
+def test_soundings_later_than_the_track_are_told(
+    states: int | None, survey: Survey, tmp_path: Path
+) -> None:
+    north_m, east_m, depth_m = survey.soundings_ned_m.T
+    time_s = np.linspace(0.0, 39.99 if states == 40 else 59.99, len(north_m))
+    columns = {"north_m": north_m, "east_m": east_m, "depth_m": depth_m, "time_s": time_s}
+    if states is not None:
+        at = np.arange(float(states))
+        columns |= {"track_time_s": at, "track_north_m": at, "track_east_m": 0.0 * at}
+        columns |= {"track_yaw_rad": 0.0 * at}
+    np.savez(tmp_path / "s.npz", **columns)
+    told = compress_file(tmp_path / "s.npz", tmp_path / "f.bin", "lattice", settings=QUICK)
+    late = re.search(r"; (\d+) soundings are later than the track.* 39 s after the first", told)
+    if states == 40:
+        assert late is None
+    else:
+        assert late is not None
+        assert int(late[1]) == np.count_nonzero(time_s > 39.0 + 1.25)
+
+
 @pytest.mark.parametrize("other", [np.array("a note"), np.array([None]), np.array([1j])])
 def test_arrays_beside_the_soundings_are_left_alone(
     other: Array, survey: Survey, tmp_path: Path

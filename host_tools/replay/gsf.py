@@ -1,13 +1,14 @@
 """GSF logs of real surveys as the soundings that `fathomlink compress` takes.
 
 GSF keeps each beam's depth, across-track and along-track distance, corrected for attitude and
-refraction; they are turned by the ping's heading into a metric projection. Read with gsfu, an
-optional dependency: `pip install fathomlink[replay]`.
+refraction; they are turned by the ping's heading, from true north, into a metric projection. Read
+with gsfu, an optional dependency: `pip install fathomlink[replay]`.
 """
 
 import argparse
 import datetime
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from protocol.errors import ConfigError
 
 IGNORED_BEAM = 0x01  # bit 0 of a beam's flags, and of a ping's
 GEOGRAPHIC = "EPSG:4326"
+_STEP_DEG = 1e-3  # of latitude, a hundred metres
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,10 +75,11 @@ def read_gsf(path: Path) -> ReplayedLine:
     track_m = np.stack([north, east], axis=1)
     began_s = ping_s(pings[0])
     times_s = np.array([ping_s(ping) - began_s for ping in pings])
-    yaw_rad = np.radians([float(ping["Heading_deg"]) for ping in pings])
+    heading_rad = np.radians([float(ping["Heading_deg"]) for ping in pings])
+    yaw_rad = (heading_rad + true_north_rad(crs, longitude, latitude)) % (2.0 * np.pi)
     parts, sizes = [], []
-    for ping, position_m, heading_rad in zip(pings, track_m - track_m[0], yaw_rad, strict=True):
-        soundings_m, beams = _soundings(ping, position_m, float(heading_rad))
+    for ping, position_m, ping_yaw_rad in zip(pings, track_m - track_m[0], yaw_rad, strict=True):
+        soundings_m, beams = _soundings(ping, position_m, float(ping_yaw_rad))
         parts.append(soundings_m)
         sizes.append((len(soundings_m), beams))
     points_m = np.concatenate(parts)
@@ -101,6 +104,19 @@ def utm_of(longitude_deg: float, latitude_deg: float) -> str:
     """Return the UTM zone of a position as an EPSG code."""
     zone = min(60, int((longitude_deg + 180.0) // 6.0) + 1)
     return f"EPSG:{(32600 if latitude_deg >= 0.0 else 32700) + zone}"
+
+
+def true_north_rad(
+    crs: str, longitude_deg: Sequence[float], latitude_deg: Sequence[float]
+) -> Array:
+    """Return the bearings (T,) of true north from the grid's north, positive to the east."""
+    farther_deg = [degrees + _STEP_DEG for degrees in latitude_deg]
+    east_m, north_m = np.subtract(
+        transform(GEOGRAPHIC, crs, longitude_deg, farther_deg)[:2],
+        transform(GEOGRAPHIC, crs, longitude_deg, latitude_deg)[:2],
+    )
+    bearings_rad: Array = np.arctan2(east_m, north_m)
+    return bearings_rad
 
 
 def _pings(path: Path) -> list[dict[str, Any]]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from host_tools.cli import main
-from host_tools.replay.gsf import ping_s, read_gsf, utm_of
+from host_tools.replay.gsf import _pings, ping_s, read_gsf, true_north_rad, utm_of
 
 
 def logs() -> Path:
@@ -21,6 +21,17 @@ def test_utm_zone_follows_longitude_and_hemisphere() -> None:
     assert utm_of(-64.6, 17.8) == "EPSG:32620"
     assert utm_of(3.2, -42.0) == "EPSG:32731"
     assert utm_of(180.0, 1.0) == "EPSG:32660"
+
+
+@pytest.mark.parametrize(("longitude_deg", "latitude_deg"), [(-64.6, 17.8), (-61.0, -40.0)])
+def test_true_north_is_turned_by_the_convergence_of_meridians(
+    longitude_deg: float, latitude_deg: float
+) -> None:
+    crs = utm_of(longitude_deg, latitude_deg)
+    aside_rad = np.radians(longitude_deg + 63.0)  # of the zone's meridian
+    turned = np.tan(aside_rad) * np.sin(np.radians(latitude_deg))
+    bearings_rad = true_north_rad(crs, [longitude_deg], [latitude_deg])
+    np.testing.assert_allclose(np.degrees(bearings_rad), -np.degrees(np.arctan(turned)), atol=1e-3)
 
 
 def test_times_of_pings_are_utc(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -43,6 +54,9 @@ def test_gsf_line_lies_where_and_as_deep_as_it_was_surveyed() -> None:
     length_m = np.hypot(np.diff(line.track_north_m), np.diff(line.track_east_m)).sum()
     assert length_m == pytest.approx(1250, rel=0.05)
     assert line.crs == "EPSG:32620"
+    headings_deg = [ping["Heading_deg"] for ping in _pings(logs() / "em302_line_0059.gsf")]
+    turned_deg = np.degrees(line.track_yaw_rad) - headings_deg
+    np.testing.assert_allclose(turned_deg, 0.488, atol=0.01)  # 1.6 degrees west of the meridian
     course = np.arctan2(line.track_east_m[-1], line.track_north_m[-1])
     assert np.degrees(np.abs(course - np.median(line.track_yaw_rad))) < 15
 

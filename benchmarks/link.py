@@ -1,7 +1,8 @@
 """Sub-maps complete with and without selective repeat, and the air that it takes.
 
 `python -m benchmarks.link` prints the table: one leader and one to four followers over the model of
-the water, extended answers, `dense` frames; plain broadcast is the paper's link.
+the water, extended answers, `dense` frames, reassembly as the leader sets it for these slots; plain
+broadcast is the paper's link.
 """
 
 import argparse
@@ -10,24 +11,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from firmware.leader.settings import LeaderSettings, reassembly_of
 from protocol.acoustics import Water, WaterSettings
 from protocol.codec import decode, encode
 from protocol.packets import ExtendedAnswer, Header, Profile, SubmapFragment
-from protocol.reassembly import Reassembler, ReassemblySettings, SubmapTransfer
+from protocol.reassembly import Reassembler, SubmapTransfer
 from protocol.repeats import FragmentQueue, RepeatSettings
 from protocol.schedule import Slots, SlotSettings
 from protocol.timestamps import to_quarters, to_tx_second, transmission_s
 from protocol.vehicles import LEADER
 
-SUBMAP_S = 40
+LEADER_SETTINGS = LeaderSettings(answers="extended")
+SUBMAP_S = int(LEADER_SETTINGS.submaps.duration_s)
 CASES = (
-    # followers, frames, sub-map seconds
-    (1, 10, 40),
-    (1, 8, 40),
-    (1, 6, 40),
-    (2, 4, 40),
-    (4, 2, 40),
-    (4, 8, 160),
+    # followers, frames
+    (1, 10),
+    (1, 8),
+    (1, 6),
+    (2, 4),
+    (4, 2),
 )
 
 
@@ -44,7 +46,7 @@ class Result:
 
     @property
     def complete_share(self) -> float:
-        """Of the sub-maps handed to the leader's reconstruction."""
+        """Of all sub-maps that were made."""
         return self.complete / self.submaps
 
     @property
@@ -67,21 +69,18 @@ def trial(
     repeats: bool = True,
     hours: float = 2.0,
     seed: int = 1,
-    submap_s: int = SUBMAP_S,
     water: WaterSettings | None = None,
 ) -> Result:
     """Return the result of some hours of sub-maps over one water."""
     settings = replace(water or WaterSettings(), loss=loss)
     medium = Water(settings, np.random.default_rng(seed), _place, range(followers + 1))
     slots = Slots(SlotSettings(followers=followers))
-    reassembler = Reassembler(
-        ReassemblySettings(slots=6 * followers, overtaken_s=3.5 * submap_s, oldest_s=6.0 * submap_s)
-    )
+    reassembler = Reassembler(reassembly_of(LEADER_SETTINGS, slots))
     fleet = {k: _Follower(FragmentQueue(RepeatSettings())) for k in range(1, followers + 1)}
     transfers: list[SubmapTransfer] = []
     answers = 0
     turn = 0
-    for second in range(int(3600 * hours) + 6 * submap_s):
+    for second in range(int(3600 * hours) + 6 * SUBMAP_S):
         now_s = float(second)
         _deliver(medium, now_s, reassembler, fleet if repeats else {})
         reassembler.advance(now_s)
@@ -90,11 +89,11 @@ def trial(
                 transfers.append(event)
         running = now_s < 3600 * hours
         for number, follower in fleet.items():
-            if running and second % submap_s == 0:
+            if running and second % SUBMAP_S == 0:
                 follower.queue.add(_fragments(number, follower.submap, frames, now_s))
                 follower.submap += 1
             if slots.next_follower_slot_s(now_s, number) == now_s:
-                left = _slots_left(second, submap_s, followers) if running else 1000
+                left = _slots_left(second, followers) if running else 1000
                 fragment = follower.queue.next_fragment(now_s, left)
                 if fragment is not None:
                     medium.transmit(number, now_s, encode(fragment))
@@ -103,7 +102,7 @@ def trial(
             medium.transmit(LEADER, now_s, encode(_answer(reassembler, turn, answers, now_s)))
             answers += 1
     done = [transfer for transfer in transfers if transfer.is_complete]
-    delays = [t.last_arrival_s - t.submap * submap_s for t in done]
+    delays = [t.last_arrival_s - t.submap * SUBMAP_S for t in done]
     counters = [follower.queue.counters for follower in fleet.values()]
     return Result(
         submaps=sum(follower.submap for follower in fleet.values()),
@@ -119,9 +118,9 @@ def _place(node: int, _: float) -> tuple[float, float, float]:
     return 150.0 * node, 100.0 * node, 10.0
 
 
-def _slots_left(second: int, submap_s: int, followers: int) -> int:
+def _slots_left(second: int, followers: int) -> int:
     period_s = 4 * followers
-    return 1 + (submap_s - 1 - second % submap_s) // period_s
+    return 1 + (SUBMAP_S - 1 - second % SUBMAP_S) // period_s
 
 
 def _fragments(vehicle: int, submap: int, count: int, now_s: float) -> list[SubmapFragment]:
@@ -195,13 +194,12 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args(arguments)
     print(f"loss {options.loss:.0%}, {options.hours:g} h, seed {options.seed}")
-    print("followers  frames  sub-map s  link       complete  extra air  mean delay s")
-    for followers, frames, submap_s in CASES:
+    print("followers  frames  link       complete  extra air  mean delay s")
+    for followers, frames in CASES:
         for repeats in (False, True):
             result = trial(
                 followers=followers,
                 frames=frames,
-                submap_s=submap_s,
                 repeats=repeats,
                 loss=options.loss,
                 hours=options.hours,
@@ -209,7 +207,7 @@ def main(arguments: list[str]) -> None:
             )
             name = "repeats" if repeats else "broadcast"
             print(
-                f"{followers:9d}  {frames:6d}  {submap_s:9d}  {name:9s}"
+                f"{followers:9d}  {frames:6d}  {name:9s}"
                 f"  {result.complete_share:8.2%}  {result.extra_air:9.2%}"
                 f"  {result.mean_delay_s:12.1f}"
             )

@@ -25,6 +25,7 @@ from firmware.leader.ledger import (
     RangeRecord,
     Record,
     SharedDriftRecord,
+    TieRecord,
     as_reckoned,
 )
 from protocol.settings import Settings, setting
@@ -99,12 +100,12 @@ def kept_nodes(
 
 
 def pinned_keys(entries: Iterable[Entry]) -> set[int]:
-    """Return the keys of nodes that priors and shared drifts speak of."""
+    """Return the keys of nodes that priors, shared drifts and ties of boots speak of."""
     pinned: set[int] = set()
     for entry in entries:
         if isinstance(entry.record, PriorRecord):
             pinned.add(entry.record.key)
-        elif isinstance(entry.record, SharedDriftRecord):
+        elif isinstance(entry.record, SharedDriftRecord | TieRecord):
             pinned |= {entry.record.origin, entry.record.target}
     return pinned
 
@@ -159,7 +160,7 @@ class Composition:
                         fixes[record.anchor.key].append((number, entry, record))
                         continue
                     kept[number] = Entry(record=record, active=entry.active)
-                case PriorRecord() | SharedDriftRecord() as record:
+                case PriorRecord() | SharedDriftRecord() | TieRecord() as record:
                     kept[number] = Entry(record=record, active=entry.active)
         new: list[Record] = []
         for fix_group in fixes.values():

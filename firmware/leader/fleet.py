@@ -20,7 +20,6 @@ from firmware.leader.range_windows import RangeWindows
 from firmware.leader.tracks import TrackBuffer
 from firmware.leader.trajectory import Trajectory
 from firmware.submaps import Track
-from protocol.errors import EstimationError
 from protocol.packets import Header, usable_states
 from protocol.settings import Settings, setting
 from protocol.timestamps import from_quarters
@@ -228,27 +227,18 @@ class Fleet:
         self._graph.extend(before, old)
         last_s = float(old.time_s[-1])
         gap_s = max(time_s - last_s, 0.0)
-        trajectory = self._graph.trajectory(before)
-        expected_m = trajectory.correct(last_s, old.position_at(last_s))
-        moved_m, sigma_m = np.zeros(2), self._settings.fastest_mps / 2 * gap_s + 5.0
-        velocity_mps = (old.position_at(last_s) - old.position_at(last_s - 5.0)) / 5.0
-        on_m = start_m - old.position_at(last_s)
+        last_m = old.position_at(last_s)
+        velocity_mps = (last_m - old.position_at(last_s - 5.0)) / 5.0
+        on_m = start_m - last_m
+        reached_m, sigma_m = last_m, self._settings.fastest_mps / 2 * gap_s + 5.0
         goes_on = np.hypot(*(on_m - velocity_mps * gap_s)) < _CONTINUES_M + 0.2 * np.sqrt(gap_s)
         if time_s < last_s:  # by a clock set back: nobody knows how long ago the old one ended
-            moved_m, sigma_m = on_m, 5.0 + float(np.hypot(*on_m))
+            reached_m, sigma_m = start_m, 5.0 + float(np.hypot(*on_m))
         elif goes_on and np.hypot(*on_m) > _HELD_M:
-            moved_m, sigma_m = on_m - trajectory.bias_at(last_s) * gap_s, 1.0 + 0.02 * gap_s
-        self._graph.add_chain(
-            chain, time_s, start_m, expected_m + moved_m, start_sigma_m=1e4, like=before
+            reached_m, sigma_m = start_m, 1.0 + 0.02 * gap_s
+        self._graph.add_boot(
+            chain, time_s, start_m, after=before, reached_m=reached_m, sigma_m=sigma_m
         )
-        try:
-            ends = (
-                self._graph.anchor(before, last_s, old),
-                self._graph.anchor(chain, time_s, track),
-            )
-            self._graph.add_closure(*ends, moved_m, sigma_m**2 * np.eye(2), active=True)
-        except EstimationError:
-            self.counters["restarts_untied"] += 1
 
 
 def _columns(track: Track) -> tuple[Array, Array, Array, Array]:

@@ -97,6 +97,14 @@ class OdometryRecord:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class TieRecord(OdometryRecord):
+    """Dead reckoning across a restart: from a node of one boot to the next one's first.
+
+    The position's sigma holds how far the vehicle may have come unheard.
+    """
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SharedDriftRecord:
     """Two vehicles in one water: the biases of two nodes agree within the sigma."""
 

@@ -32,6 +32,7 @@ from firmware.leader.ledger import (
     RangeRecord,
     Record,
     SharedDriftRecord,
+    TieRecord,
 )
 from firmware.leader.wander import expected_walk, likely_walk, reckoned_m2
 from firmware.submaps import Track
@@ -46,46 +47,70 @@ class PoseGraph(Estimate):
         super().__init__(settings)
         self._entered = 0
 
-    def add_chain(
-        self,
-        chain_id: int,
-        time_s: float,
-        reckoned_m: Array,
-        start_m: Array,
-        *,
-        start_sigma_m: float | None = None,
-        like: int | None = None,
-    ) -> None:
-        """Start a vehicle's chain at a position (2,), as uncertain as its time says, or as told.
+    def add_chain(self, chain_id: int, time_s: float, reckoned_m: Array, start_m: Array) -> None:
+        """Start a vehicle's chain at a position (2,), as uncertain as its time says.
 
-        Its drift is like that of the first chain; or of the chain `like`, an earlier boot's, whose
-        newest drift it goes on with.
+        Its drift is like that of the first chain.
         """
         s = self._settings
         number = len(self._chains)
         chain = Chain(number=number, parameters=gtsam.symbol("p", number))
         if number > 0 and s.clock_offset_sigma_ms > 0.0:
-            chain.clock = self._clock_of(number, like)
+            chain.clock = self._new_clock(number)
         self._chains[chain_id] = chain
         state = np.concatenate([start_m, np.zeros(2)])
         key = self._append(chain, time_s, reckoned_m, state)
         self._solver.introduce(chain.parameters, np.zeros(2))
-        sigmas = np.repeat([start_sigma_m or s.start_sigma_at(time_s), s.bias_sigma_mps], 2)
+        sigmas = np.repeat([s.start_sigma_at(time_s), s.bias_sigma_mps], 2)
         self._enter(PriorRecord(key=key, mean=state, sigmas=sigmas))
         calibration = np.array([np.radians(s.heading_bias_sigma_deg), s.log_scale_sigma])
         self._enter(PriorRecord(key=chain.parameters, mean=np.zeros(2), sigmas=calibration))
         if number > 0:
-            first = next(iter(self._chains.values())) if like is None else self._chains[like]
-            nearest = first.nearest(time_s)
-            gap_s = abs(time_s - first.times_s[nearest])
-            wandered_mps = float(self._walk * np.sqrt(gap_s + s.node_interval_s))
+            first = next(iter(self._chains.values()))
             self._enter(
                 SharedDriftRecord(
-                    origin=first.keys[nearest],
+                    origin=first.keys[first.nearest(time_s)],
                     target=key,
-                    sigma_mps=s.bias_difference_mps if like is None else wandered_mps,
+                    sigma_mps=s.bias_difference_mps,
                 )
             )
+
+    def add_boot(
+        self,
+        chain_id: int,
+        time_s: float,
+        reckoned_m: Array,
+        *,
+        after: int,
+        reached_m: Array,
+        sigma_m: float,
+    ) -> None:
+        """Start the chain of a vehicle's next boot, which goes on where the chain `after` ends.
+
+        reached_m (2,) is where that chain's dead reckoning would have it by then, within sigma_m.
+        Compass, log and clock are the same as before, and so is the drift, but for its wandering.
+        """
+        s, old = self._settings, self._chains[after]
+        chain = Chain(number=len(self._chains), parameters=old.parameters, clock=old.clock)
+        self._chains[chain_id] = chain
+        origin, moved_m = old.keys[-1], reached_m - old.reckoned_m[-1]
+        passed_s = time_s - old.times_s[-1]
+        interval_s = max(passed_s, 0.0)  # of a clock that was set back nobody knows it
+        variance_m2 = reckoned_m2(interval_s, s.odometry_noise, self._walk, start_m=sigma_m)
+        wandered_mps = self._walk * np.sqrt(abs(passed_s) + s.node_interval_s)
+        state = self._state(origin).copy()
+        state[:2] += moved_m - state[2:] * interval_s
+        self._enter(
+            TieRecord(
+                origin=origin,
+                target=self._append(chain, time_s, reckoned_m, state),
+                parameters=chain.parameters,
+                moved_m=moved_m,
+                interval_s=interval_s,
+                position_sigma_m=float(np.sqrt(variance_m2)),
+                bias_sigma_mps=float(wandered_mps),
+            )
+        )
 
     def extend(self, chain_id: int, track: Track) -> int:
         """Add the nodes that a vehicle's newly known track allows; return how many.
@@ -253,11 +278,8 @@ class PoseGraph(Estimate):
         self._append(chain, time_s, reckoned_m, state)
         self._join(chain, len(chain.keys) - 1)
 
-    def _clock_of(self, number: int, like: int | None) -> int:
-        """Return the key of a chain's clock: that of an earlier boot, or a new one."""
-        earlier = None if like is None else self._chains[like].clock
-        if earlier is not None:
-            return earlier
+    def _new_clock(self, number: int) -> int:
+        """Return the key of a clock that nothing is known of yet."""
         key, s = gtsam.symbol("c", number), self._settings
         self._solver.introduce(key, np.zeros(2))
         drift_m_per_h = max(s.clock_drift_sigma_m_per_h, _STEADY_M_PER_H)

@@ -36,7 +36,7 @@ from firmware.soundings import Odometry, Ping
 from firmware.submap_builder import SubmapBuilder
 from firmware.submaps import Submap, Track, joined
 from protocol.codec import decode, encode
-from protocol.errors import RemoteProtocolError
+from protocol.errors import EstimationError, RemoteProtocolError
 from protocol.packets import SealedFrame, SubmapFragment, SubmapPacket, TrajectoryPacket
 from protocol.reassembly import Reassembler
 from protocol.schedule import Slots, Turns
@@ -93,7 +93,7 @@ class LeaderCore:
         self.outlook = Outlook(
             self.fleet, self.graph, self.atlas, settings.manoeuvre, settings.matching
         )
-        self.composed_s = start.time_s
+        self.composed_s = self._tried_s = start.time_s  # to compose may fail
         self._turns = Turns(slots, LEADER, start.time_s)
         start_m = np.array([start.north_m, start.east_m])
         self.graph.add_chain(LEADER, start.time_s, start_m, start_m)
@@ -159,8 +159,7 @@ class LeaderCore:
             self._add_sheet(sheet)
         self._fixes.use(self.fleet, self.graph, now_s)
         if self._is_to_compose and not self._closing.is_matching:
-            self.composed_s = self.graph.newest_s
-            self._compose(self.composed_s)
+            self._compose(self.graph.newest_s)
 
     @property
     def has_jobs(self) -> bool:
@@ -257,15 +256,21 @@ class LeaderCore:
     @property
     def _is_to_compose(self) -> bool:
         """Whether the past is to be composed as soon as no matches are out."""
-        return self.graph.newest_s - self.composed_s >= self._settings.composition.interval_s
+        return self.graph.newest_s - self._tried_s >= self._settings.composition.interval_s
 
     def _compose(self, newest_s: float) -> None:
         """Make the past coarse, so that a day costs no more an hour than its first hours.
 
-        It is the past of the newest node: a clock that leaps makes nothing old.
+        It is the past of the newest node: a clock that leaps makes nothing old. Where the graph
+        tells no covariance it stays as it is until the next time.
         """
-        settings = self._settings.composition
-        self.graph.compose(newest_s, settings)
+        settings, self._tried_s = self._settings.composition, newest_s
+        try:
+            self.graph.compose(newest_s, settings)
+        except EstimationError:
+            self.counters["compositions_failed"] += 1
+            return
+        self.composed_s = newest_s
         detail_s = detail_from_s(newest_s, settings)
         self._closing.forget(detail_s)
         self.fleet.settle(detail_s)

@@ -36,6 +36,7 @@ from firmware.leader.ledger import (
 )
 from firmware.leader.wander import expected_walk, likely_walk, reckoned_m2
 from firmware.submaps import Track
+from protocol.errors import EstimationError
 
 _STEADY_M_PER_H = 0.01  # of a clock whose rate is not asked for
 
@@ -254,7 +255,11 @@ class PoseGraph(Estimate):
         self._forget_solution()
 
     def _learned_walk(self, now_s: float) -> float:
-        s, changes = self._settings, self.drift_changes(now_s)
+        s = self._settings
+        try:
+            changes = self.drift_changes(now_s)
+        except EstimationError:  # what is not known now may be the next time
+            changes = []
         if not changes:
             return self._walk
         return (

@@ -157,9 +157,10 @@ class Solver:
         for number, entry in self._ledger.items():
             if isinstance(entry.record, _RECKONING):
                 graph.push_back(self._factor(number))
-        isam = _new_isam(self._factorization)
-        isam.update(graph, self._values)
-        return isam
+        try:
+            return _isam_of(graph, self._values, self._factorization)
+        except RuntimeError:
+            return _isam_of(graph, self._values, "QR")
 
     def _factor(self, number: int) -> gtsam.NonlinearFactor:
         if number not in self._factors:
@@ -180,6 +181,14 @@ def _values_of(estimate: Mapping[int, Array]) -> gtsam.Values:
     for key, vector in estimate.items():
         values.insert(key, vector)
     return values
+
+
+def _isam_of(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, factorization: str
+) -> gtsam.ISAM2:
+    isam = _new_isam(factorization)
+    isam.update(graph, values)
+    return isam
 
 
 def _new_isam(factorization: str) -> gtsam.ISAM2:

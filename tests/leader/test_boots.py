@@ -13,6 +13,7 @@ from firmware.leader.ledger import TieRecord
 from firmware.leader.pose_graph import PoseGraph
 from firmware.leader.range_judge import RangeSettings
 from firmware.leader.range_windows import RangeWindows
+from firmware.submaps import Track
 from protocol.codec import decode
 from tests.leader.vessels import (
     changed,
@@ -242,6 +243,21 @@ def test_past_with_restarts_is_composed(boots: int) -> None:
     assert graph.nodes < 0.6 * 720
     estimate = fleet.whole_trajectory(1)
     np.testing.assert_allclose(estimate.position_m, estimate.reckoned_m, atol=0.1)
+
+
+def test_dead_reckoning_alone_is_told_of_a_boot_after_hours_unheard() -> None:
+    graph = PoseGraph(GraphSettings())
+    time_s = np.arange(301.0)
+    track = Track(time_s=time_s, north_m=2 * time_s, east_m=0 * time_s, yaw_rad=0 * time_s)
+    graph.add_chain(0, 0.0, np.zeros(2), np.zeros(2))
+    graph.extend(0, track)
+    graph.add_boot(16, 7200.0, np.zeros(2), after=0, reached_m=np.zeros(2), sigma_m=2e4)
+    later = dataclasses.replace(track, time_s=track.time_s + 7200.0)
+    graph.extend(16, later)
+    graph.add_absolute(graph.anchor(16, 7200.0, later), np.zeros(2), np.eye(2))
+    reckoned = graph.newest_covariance([16], reckoned=True)
+    assert graph.rebuilds == 0
+    assert np.sqrt(reckoned[0, 0]) == pytest.approx(2e4, rel=0.01)
 
 
 def test_restarts_tell_nothing_of_drift_compass_or_log() -> None:

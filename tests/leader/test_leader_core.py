@@ -10,6 +10,7 @@ from firmware.leader.core import LeaderCore
 from firmware.leader.ledger import OdometryRecord
 from firmware.leader.settings import LeaderSettings, reassembly_of
 from protocol.codec import decode, encode
+from protocol.errors import EstimationError
 from protocol.packets import (
     Answer,
     ExtendedAnswer,
@@ -197,6 +198,27 @@ def test_clock_that_leaps_ahead_neither_stops_composition_nor_coarsens_the_prese
             composed_s.append(leader.composed_s)
     assert composed_s == [0.0, 600.0, 1200.0, 1800.0]
     assert len(leader.graph.trajectory(0).time_s) > leader.graph.nodes > 1200 / 10
+
+
+def test_composition_that_fails_is_tried_again_an_interval_later(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    path = line(0.0, 0.0)
+    leader = leader_of(path)
+
+    def fails(*_: object) -> None:
+        raise EstimationError("singular")
+
+    monkeypatch.setattr(leader.graph, "compose", fails)
+    for second in range(1, 1300):
+        sail(leader, path, float(second), sonar_on=False)
+        leader.tick(float(second))
+        if second == 700:
+            assert leader.status()["compositions_failed"] == 1
+            assert leader.composed_s == 0.0
+            monkeypatch.undo()
+    assert leader.status()["compositions_failed"] == 1
+    assert leader.composed_s == 1200.0
 
 
 def test_navigation_between_whole_seconds_is_tracked_as_well() -> None:

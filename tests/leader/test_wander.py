@@ -9,6 +9,7 @@ from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.pose_graph import PoseGraph
 from firmware.leader.wander import DriftChange, changes_of, expected_walk, likely_walk
 from firmware.submaps import Track
+from protocol.errors import EstimationError
 
 INTERVAL_S = 300.0
 BELIEVED, FACTOR = 0.004, 2.0
@@ -84,6 +85,21 @@ def test_vehicles_that_share_a_drift_do_not_vouch_for_stillness(vehicles: int) -
         joint = graph._solver.covariance([key for key in keys if key is not None])[2::4, 2::4]
         walk = np.sqrt((joint[0, 0] + joint[1, 1] - 2 * joint[0, 1]) / 600.0)
         assert walk == pytest.approx(BELIEVED, rel=0.1)
+
+
+def test_graph_that_cannot_tell_its_drift_is_composed_and_learns_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    graph = _laps(0.1 * np.ones((3000, 2)), np.random.default_rng(1))
+    learned, nodes = graph.wandering.walk, graph.nodes
+
+    def fails(_: float) -> list[DriftChange]:
+        raise EstimationError("singular")
+
+    monkeypatch.setattr(graph, "drift_changes", fails)
+    graph.compose(3600.0, CompositionSettings())
+    assert graph.nodes < nodes
+    assert graph.wandering.walk == learned
 
 
 def _laps(current_mps: Array, rng: np.random.Generator) -> PoseGraph:

@@ -3,7 +3,8 @@
 Beyond the window of detail a chain keeps one node a piece. What lies between is frozen in the shape
 that it was last estimated in, and moves with the nodes around it; dead reckoning, fixes, ranges and
 closures of a piece are composed. A piece keeps its closures with the oldest pieces, which the start
-holds best: so the past hangs on a fixed map rather than on all of itself.
+holds best: so the past hangs on a fixed map rather than on all of itself. Hints it keeps where it
+has no closures.
 """
 
 from collections import defaultdict
@@ -31,6 +32,7 @@ from firmware.leader.ledger import (
 from protocol.settings import Settings, setting
 
 _COARSER = 4  # from level to level, pieces and the age at which they begin alike
+_VAGUE = 0.04  # of the information of a piece's surest closure: what tells less is but a hint
 Link = TypeVar("Link", ClosureRecord, RangeRecord)
 Kept = TypeVar("Kept", ClosureRecord, RangeRecord, AbsoluteRecord)
 Group = list[tuple[int, Entry, Kept]]  # of a piece or two: number, entry as it was, as moved
@@ -209,9 +211,9 @@ class Composition:
         """Return what stays of the groups: their active closures that the estimate believes.
 
         A group belongs to the newer of its two pieces; of each piece those with the oldest others
-        stay. What lies within one piece goes.
+        stay, vague ones after all others. What lies within one piece goes.
         """
-        by_piece: dict[int, list[tuple[float, Group[ClosureRecord]]]] = defaultdict(list)
+        by_piece: dict[int, list[tuple[float, float, Group[ClosureRecord]]]] = defaultdict(list)
         for (origin, target), group in closures.items():
             believed = [item for item in group if item[1].active and self._is_true(item[2])]
             if origin == target or not believed:
@@ -220,14 +222,14 @@ class Composition:
                 (anchor.time_s, anchor.key)
                 for anchor in (believed[0][2].origin, believed[0][2].target)
             )
-            by_piece[ends[1][1]].append((ends[0][0], believed))
-        return [
-            group
-            for groups in by_piece.values()
-            for _, group in sorted(groups, key=lambda item: item[0])[
-                : self._settings.closures_per_piece
-            ]
-        ]
+            told = max(record.information for _, _, record in believed)
+            by_piece[ends[1][1]].append((told, ends[0][0], believed))
+        thinned = []
+        for groups in by_piece.values():
+            vague = _VAGUE * max(told for told, _, _ in groups)
+            groups.sort(key=lambda item: (item[0] < vague, item[1]))
+            thinned += [group for _, _, group in groups[: self._settings.closures_per_piece]]
+        return thinned
 
     def _is_true(self, record: ClosureRecord) -> bool:
         chi_square = record.chi_square(self._estimate.__getitem__)

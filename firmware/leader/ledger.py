@@ -145,6 +145,11 @@ class ClosureRecord:
             return self
         return replace(self, origin=self.target, target=self.origin, offset_m=-self.offset_m)
 
+    @property
+    def information(self) -> float:
+        """How much it tells, in 1/m^2, of both axes together."""
+        return float(np.trace(np.linalg.inv(self.covariance_m2)))
+
     def innovation_m(self, states: States) -> Array:
         """Return estimated minus measured offset (2,)."""
         return position_of(self.target, states) - position_of(self.origin, states) - self.offset_m

@@ -291,17 +291,24 @@ def test_closure_beyond_its_sigmas_is_not_taken_along() -> None:
 
 
 def told_by(*records: ClosureRecord) -> list[ClosureRecord]:
-    """Return what composing leaves of closures between the nodes 1 and 11, which lie 10 m apart."""
-    states = {1: np.zeros(4), 11: np.array([10.0, 0.0, 0.0, 0.0]), 90: np.array([0.02, 0.01])}
-    composition = Composition({}, {}, {1, 11}, {**states, 91: np.zeros(2)}, SETTINGS)
+    """Return what composing leaves of closures between the nodes 1 to 3 and 11, 10 m farther on."""
+    states = {key: np.zeros(4) for key in (1, 2, 3)} | {11: np.array([10.0, 0.0, 0.0, 0.0])}
+    states |= {90: np.array([0.02, 0.01]), 91: np.zeros(2)}
+    composition = Composition({}, {}, {1, 2, 3, 11}, states, SETTINGS)
     ledger = {k: Entry(record=record, active=True) for k, record in enumerate(records)}
     coarse = composition.coarse(ledger)
     left = [*(entry.record for entry in coarse.kept.values()), *coarse.new]
     return [record for record in left if isinstance(record, ClosureRecord)]
 
 
-def closure(covariance_m2: Array, north_m: float = 10.0) -> ClosureRecord:
-    here = Anchor(key=1, parameters=90, offset_m=np.zeros(2), time_s=10.0, lever_m=np.full(2, 9.0))
+def closure(covariance_m2: Array, north_m: float = 10.0, key: int = 1) -> ClosureRecord:
+    here = Anchor(
+        key=key,
+        parameters=90,
+        offset_m=np.zeros(2),
+        time_s=10.0 * key,
+        lever_m=np.full(2, 9.0),
+    )
     there = Anchor(key=11, parameters=91, offset_m=np.zeros(2), time_s=99.0)
     offset_m = np.array([north_m, 0.0])
     return ClosureRecord(origin=here, target=there, offset_m=offset_m, covariance_m2=covariance_m2)
@@ -329,6 +336,18 @@ def test_closure_that_stays_alone_is_told_as_it_was() -> None:
         (left,) = told_by(record)
         assert (left.origin.key, left.target.key) == (record.origin.key, record.target.key)
         np.testing.assert_array_equal(left.offset_m, record.offset_m)
+
+
+def test_closures_with_the_oldest_pieces_stay_and_hints_where_there_is_room() -> None:
+    sure_m2, hint_m2 = np.eye(2), 400.0 * np.eye(2)
+    for told, stay in (
+        ((sure_m2, 4.0 * sure_m2, 0.5 * sure_m2), [1, 2]),
+        ((hint_m2, hint_m2, sure_m2), [1, 3]),
+        ((hint_m2, 9.0 * sure_m2, sure_m2), [2, 3]),
+        ((hint_m2, hint_m2, hint_m2), [1, 2]),
+    ):
+        left = told_by(*(closure(each, key=key) for key, each in enumerate(told, start=1)))
+        assert sorted(record.origin.key for record in left) == stay
 
 
 def test_closures_alike_are_as_uncertain_as_one_and_vague_ones_take_nothing_from_a_sure_one() -> (

@@ -7,6 +7,7 @@ moved to the nearest node by dead reckoning, so that no node is ever inserted be
 """
 
 import itertools
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -178,18 +179,19 @@ class PoseGraph(Estimate):
     ) -> int:
         """Enter a one-way range between two anchors, active, and return its number.
 
-        spread_m is its sigma beside that of the settings; the target is of the sender, whose clock
-        may err.
+        spread_m is its sigma beside that of the settings and of the ways to the nodes; the target
+        is of the sender, whose clock may err.
         """
-        return self._enter(
-            RangeRecord(
-                origin=origin,
-                target=target,
-                range_m=range_m,
-                sigma_m=float(np.hypot(self._settings.range_sigma_m, spread_m)),
-                clock=None if sender is None else self._chains[sender].clock,
-            )
+        record = RangeRecord(
+            origin=origin,
+            target=target,
+            range_m=range_m,
+            sigma_m=float(np.hypot(self._settings.range_sigma_m, spread_m)),
+            clock=None if sender is None else self._chains[sender].clock,
         )
+        _, along = record.innovation_m(self._state)
+        apart_m = np.sqrt(along @ (origin.apart_m2 + target.apart_m2) @ along)
+        return self._enter(replace(record, sigma_m=float(np.hypot(record.sigma_m, apart_m))))
 
     def add_absolute(self, anchor: Anchor, position_m: Array, covariance_m2: Array) -> int:
         """Enter an absolute position (2,) of an anchor, active, and return its number."""

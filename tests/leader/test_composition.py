@@ -211,6 +211,19 @@ def test_anchor_in_the_composed_past_lies_on_the_estimated_track() -> None:
         assert voyage.graph.position(anchor) == pytest.approx(lies_m, abs=1e-6)
 
 
+def test_range_into_the_composed_past_is_as_unsure_as_a_closure_there() -> None:
+    voyage = Voyage(None).run(0, 3600)
+    voyage.graph.compose(3600.0, SETTINGS)
+    here, there = (voyage.graph.anchor(v, 613.0, voyage.tracks[v][0]) for v in (0, 1))
+    between_m = voyage.graph.offset(here, there)
+    along = between_m / np.hypot(*between_m)
+    apart_m2 = along @ (here.apart_m2 + there.apart_m2) @ along
+    record = voyage.graph.record(voyage.graph.add_range(here, there, 30.0))
+    assert isinstance(record, RangeRecord)
+    assert apart_m2 > 0.1
+    assert record.sigma_m**2 == pytest.approx(GraphSettings().range_sigma_m ** 2 + apart_m2)
+
+
 def test_fixes_of_a_piece_become_one_no_surer_than_each() -> None:
     voyage = Voyage(None, 3600)
     track, true_m = voyage.tracks[0]

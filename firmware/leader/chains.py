@@ -42,12 +42,14 @@ class Chain:
     def lose(self, begin_s: float, end_s: float) -> None:
         """Remember a span of which nobody knows how far the vehicle went; bounded."""
         if self.lost and begin_s <= self.lost[-1][1] <= end_s:
-            begin_s = self.lost.pop()[0]
+            begin_s = min(begin_s, self.lost.pop()[0])
         self.lost.append((begin_s, end_s))
         if len(self.lost) > _MOST_SPANS:
+            self.lost.sort()  # a clock that was set back tells of earlier ones later
             gaps_s = [after[0] - before[1] for before, after in itertools.pairwise(self.lost)]
             k = int(np.argmin(gaps_s))
-            self.lost[k : k + 2] = [(self.lost[k][0], self.lost[k + 1][1])]
+            (begin_s, end_s), (_, other_s) = self.lost[k : k + 2]
+            self.lost[k : k + 2] = [(begin_s, max(end_s, other_s))]
 
     def lost_m2(self, begin_s: float, end_s: float) -> float:
         """Return the variance, each axis, that lost spans add to the way in an interval.

@@ -5,6 +5,7 @@ import pytest
 
 from firmware.belief import Belief
 from firmware.follower.core import FollowerCore
+from firmware.leader.chains import Chain
 from firmware.leader.core import LeaderCore
 from firmware.soundings import Fix, Odometry, Ping
 from tests.leader.vessels import ANGLES_RAD, SHORT, Convoy, follower_of, leader_of, line, sail
@@ -233,3 +234,23 @@ def test_spans_told_by_a_clock_that_was_set_back_are_all_doubted() -> None:
     for begin_s, end_s in ((100.0, 150.0), (50.0, 55.0), (55.0, 60.0)):
         graph.lose(0, begin_s, end_s)
     assert graph._chains[0].lost == [(100.0, 150.0), (50.0, 60.0)]
+
+
+def test_span_that_is_told_late_takes_no_doubt_from_another() -> None:
+    """A clock was set back: what is lost then comes before what was doubted."""
+    chain = Chain(number=0, parameters=0)
+    chain.lose(900.0, 1200.0)
+    chain.lose(600.0, 1300.0)
+    assert chain.lost_m2(600.0, 900.0) > 0.0
+    for k in range(1100):
+        chain.lose(2000.0 + 10.0 * k, 2001.0 + 10.0 * k)
+    chain.lose(20_000.0, 20_300.0)
+    ends_s = np.arange(20_010.0, 20_310.0, 10.0)
+    doubted_m2 = [chain.lost_m2(20_000.0, end_s) for end_s in ends_s]
+    for k in range(30):
+        chain.lose(19_703.0 + 10.0 * k, 19_704.0 + 10.0 * k)
+    chain.lose(20_100.0, 20_101.0)
+    assert len(chain.lost) <= 1024
+    assert all(begin_s < end_s for begin_s, end_s in chain.lost)
+    for end_s, before_m2 in zip(ends_s, doubted_m2, strict=True):
+        assert chain.lost_m2(20_000.0, end_s) >= before_m2

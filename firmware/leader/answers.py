@@ -1,6 +1,7 @@
 """What the leader tells its followers: whose turn it is, which state is answered, in which form."""
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,14 +46,17 @@ class Answers:
             )
 
     def next_answer(
-        self, own: Belief, reassembler: Reassembler, now_s: float
+        self, belief: Callable[[], Belief], reassembler: Reassembler, now_s: float
     ) -> Answer | ExtendedAnswer | None:
-        """Return the answer of this slot, or None if nobody can be told anything."""
+        """Return the answer of this slot, or None if nobody can be told anything.
+
+        `belief` tells where the leader is; only an extended answer asks.
+        """
         vehicles = sorted(self._known, key=lambda v: (v <= self._last_vehicle, v))
         for vehicle in vehicles:
             known = self._known[vehicle]
             try:
-                answer = self._answer(vehicle, known, own, reassembler, now_s)
+                answer = self._answer(vehicle, known, belief, reassembler, now_s)
             except EstimationError:
                 self.counters["answers_unplaceable"] += 1
                 continue
@@ -63,7 +67,12 @@ class Answers:
         return None
 
     def _answer(
-        self, vehicle: int, known: KnownState, own: Belief, reassembler: Reassembler, now_s: float
+        self,
+        vehicle: int,
+        known: KnownState,
+        belief: Callable[[], Belief],
+        reassembler: Reassembler,
+        now_s: float,
     ) -> Answer | ExtendedAnswer:
         self._fleet.extend(known.chain)
         anchor = self._graph.anchor(known.chain, known.time_s, self._fleet.track(known.chain))
@@ -87,6 +96,7 @@ class Answers:
                 north_m=_float32(position_m[0]),
                 east_m=_float32(position_m[1]),
             )
+        own = belief()
         repeat_submap, missing = self._missing(vehicle, known.boot_epoch, reassembler)
         return ExtendedAnswer(
             header=header,

@@ -180,7 +180,7 @@ class LeaderCore:
         """Return the answer to transmit now, or None; followers take turns."""
         if self._turns.due_s(now_s) is None:
             return None
-        answer = self._answers.next_answer(self.belief(), self._reassembler, now_s)
+        answer = self._answers.next_answer(self.belief, self._reassembler, now_s)
         return None if answer is None else encode(answer)
 
     def belief(self) -> Belief:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from firmware.belief import Belief
 from firmware.leader.core import LeaderCore
 from firmware.leader.ledger import OdometryRecord
 from firmware.leader.settings import LeaderSettings, reassembly_of
@@ -198,6 +199,23 @@ def test_clock_that_leaps_ahead_neither_stops_composition_nor_coarsens_the_prese
             composed_s.append(leader.composed_s)
     assert composed_s == [0.0, 600.0, 1200.0, 1800.0]
     assert len(leader.graph.trajectory(0).time_s) > leader.graph.nodes > 1200 / 10
+
+
+@pytest.mark.parametrize(("answers", "asked"), [("paper", 0), ("extended", 1)])
+def test_only_an_answer_that_tells_of_the_leader_asks_where_it_is(
+    answers: str, asked: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    leader = convoy(answers=answers).leader
+    leader.receive_frame(trajectory(walked(20, 0.0), 60.0), None, 100.0)
+    beliefs, belief = [], leader.belief
+
+    def counted() -> Belief:
+        beliefs.append(belief())
+        return beliefs[-1]
+
+    monkeypatch.setattr(leader, "belief", counted)
+    assert leader.poll(111.0) is not None
+    assert len(beliefs) == asked
 
 
 def test_composition_that_fails_is_tried_again_an_interval_later(

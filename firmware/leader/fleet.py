@@ -27,6 +27,8 @@ from protocol.vehicles import BOOT_EPOCHS, LEADER
 
 _HELD_M = 1.0  # dead reckoning that stands still was held while navigation was lost
 _CONTINUES_M = 3.0  # dead reckoning that goes on lies this near to a straight continuation
+_MOST_BOOTS = 20  # of a vehicle within an hour: two senders of one number begin one by every frame
+_HOUR_S = 3600.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,10 +48,11 @@ class FleetSettings(Settings):
 
 @dataclass(slots=True)
 class _Vehicle:
-    """What is known of one follower's present boot."""
+    """What is known of one follower's present boot, and when its newest ones began."""
 
     boot: int
     jumped: deque[tuple[float, float, float]] = field(default_factory=deque)
+    begun_s: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_BOOTS))
 
 
 class Fleet:
@@ -75,21 +78,27 @@ class Fleet:
         """Return the vehicles that have a chain, the leader first."""
         return sorted({vehicle_of(chain) for chain in self._graph.chains()})
 
+    def admits(self, header: Header, now_s: float) -> bool:
+        """Return whether a frame may be used: not where it begins too many boots for an hour."""
+        known = self._followers.get(header.vehicle)
+        if known is None or self._told(header, known) <= known.boot:
+            return True
+        is_admitted = self._may_boot(known, now_s)
+        if is_admitted:
+            self.boot_of(header)
+        return is_admitted
+
     def boot_of(self, header: Header) -> int:
         """Return the boot of a frame; a late frame's may be earlier than the newest."""
         known = self._followers.get(header.vehicle)
         if known is None:
             known = self._followers[header.vehicle] = _Vehicle(boot=header.boot_epoch)
-        ahead = (header.boot_epoch - known.boot) % BOOT_EPOCHS
-        earlier = known.boot + ahead - BOOT_EPOCHS
-        is_likely = ahead >= BOOT_EPOCHS // 2 or chain_of(header.vehicle, earlier) in self._tracks
-        if ahead and earlier >= 0 and is_likely and self._is_late(header, earlier):
-            return earlier
-        if ahead:
-            known.boot += ahead
+        boot = self._told(header, known)
+        if boot > known.boot:
+            known.boot = boot
             known.jumped.clear()
             self.counters["restarts"] += 1
-        return known.boot
+        return boot
 
     def chain(self, header: Header) -> int:
         """Return the number of the chain that a frame's states belong to."""
@@ -191,7 +200,8 @@ class Fleet:
         if buffer.is_plausible(time_s, north_m, east_m, self._settings.fastest_mps):
             buffer.add(time_s, north_m, east_m, yaw_rad)
             return chain
-        jumped = self._followers[header.vehicle].jumped
+        known = self._followers[header.vehicle]
+        jumped = known.jumped
         if any(time_s == known_s for known_s, _, _ in jumped):
             return None  # told again, as every frame of a sub-map may tell its whole track
         if jumped and not 0.0 <= time_s - jumped[-1][0] <= 60.0:
@@ -202,9 +212,28 @@ class Fleet:
         jumped.append((time_s, north_m, east_m))
         if len(jumped) >= self._settings.jumped_states:
             jumped.clear()
-            self._followers[header.vehicle].boot += BOOT_EPOCHS
-            self.counters["lasting_jumps"] += 1
+            if self._may_boot(known, time_s):
+                known.boot += BOOT_EPOCHS
+                self.counters["lasting_jumps"] += 1
         return None
+
+    def _told(self, header: Header, known: _Vehicle) -> int:
+        """Return the boot that a frame tells of, beside the newest that is known."""
+        ahead = (header.boot_epoch - known.boot) % BOOT_EPOCHS
+        earlier = known.boot + ahead - BOOT_EPOCHS
+        is_likely = ahead >= BOOT_EPOCHS // 2 or chain_of(header.vehicle, earlier) in self._tracks
+        if ahead and earlier >= 0 and is_likely and self._is_late(header, earlier):
+            return earlier
+        return known.boot + ahead
+
+    def _may_boot(self, known: _Vehicle, now_s: float) -> bool:
+        """Return whether a vehicle may begin another boot now, and note it."""
+        begun_s = known.begun_s
+        if len(begun_s) == _MOST_BOOTS and abs(now_s - begun_s[0]) < _HOUR_S:
+            self.counters["boots_refused"] += 1
+            return False
+        begun_s.append(now_s)
+        return True
 
     def _is_late(self, header: Header, earlier: int) -> bool:
         """Return whether a frame is of an earlier boot: by its time where a later one has begun."""

@@ -88,6 +88,30 @@ def test_restarts_beyond_the_header_s_four_bits_are_still_told_apart() -> None:
     assert leader.vehicles() == [0, 1]
 
 
+def test_two_senders_of_one_number_begin_no_boots_without_end() -> None:
+    leader = sailed(40.0)
+    for k in range(60):
+        first_s, boot = 4.0 * k, (3, 5)[k % 2]
+        frame = changed(trajectory(walked(4, 2.0 * first_s), first_s), boot_epoch=boot)
+        leader.receive_frame(frame, None, first_s + 20.0)
+    assert leader.status()["restarts"] == leader.status()["boots_refused"] == 20
+    assert len(leader.graph.chains()) == 22
+    assert len(leader.fleet.track(leader.fleet.newest_chain(1)).time_s) > 60
+    frame = changed(trajectory(walked(4, 0.0), 3900.0), boot_epoch=5)
+    leader.receive_frame(frame, None, 3920.0)
+    assert leader.status()["restarts"] == 21
+
+
+def test_two_senders_of_one_epoch_begin_no_boots_without_end() -> None:
+    leader = sailed(40.0)
+    for k in range(60):
+        states = walked(20, 40.0 * k + 5000.0 * (k // 2 % 2))
+        leader.receive_frame(trajectory(states, 20.0 * k), None, 20.0 * k + 20.0)
+    assert leader.status()["lasting_jumps"] == 20
+    assert leader.status()["boots_refused"] > 0
+    assert len(leader.graph.chains()) == 22
+
+
 def test_late_frame_of_an_earlier_boot_does_not_start_another() -> None:
     leader = sailed(40.0)
     for boot, first_s in ((0, 20.0), (1, 60.0), (0, 40.0), (1, 80.0)):

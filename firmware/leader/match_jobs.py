@@ -16,7 +16,7 @@ from firmware.leader.estimate import Estimate
 from firmware.leader.matches import MatchingSettings, MatchOutcome, NoMatch
 from firmware.leader.matching import match
 from firmware.leader.nonconvexity import Doubt
-from firmware.leader.offsets import Offset, correction_of, corrections, offsets_of
+from firmware.leader.offsets import Offset, corrections, offsets_of
 from firmware.leader.pairing import Calibrations, Side, side_of, strain_m
 from firmware.submaps import GriddedSubmap
 
@@ -183,9 +183,9 @@ def _ranked(
     ]
     if not others:
         return []
-    centres_m = np.array([other.centre_m for other in others]) + corrections(others, estimate)
-    own_m = correction_of(sheet, estimate)
-    distances_m = np.hypot(*(centres_m - sheet.centre_m - own_m).T)
+    moves_m = corrections([sheet, *others], estimate)
+    centres_m = np.array([other.centre_m for other in others]) + moves_m[1:]
+    distances_m = np.hypot(*(centres_m - sheet.centre_m - moves_m[0]).T)
     nearest = np.argsort(distances_m, kind="stable")[: settings.screened_per_submap]
     ranked = []
     for offset in offsets_of(sheet, [others[k] for k in nearest], estimate):

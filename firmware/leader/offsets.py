@@ -101,13 +101,6 @@ def anchor_of(sheet: Sheet, estimate: Estimate) -> Anchor:
     return estimate.anchor(sheet.id.chain, sheet.time_s, sheet.track)
 
 
-def correction_of(sheet: Sheet, estimate: Estimate) -> Array:
-    """Return what is to be added (2,) to a sheet's dead reckoning at its time."""
-    trajectory = estimate.trajectory(sheet.id.chain)
-    reckoned_m = sheet.reckoned_at(sheet.time_s)
-    return trajectory.correct(sheet.time_s, reckoned_m) - reckoned_m
-
-
 def corrections(sheets: list[Sheet], estimate: Estimate) -> Array:
     """Return what is to be added (S, 2) to each sheet's dead reckoning at its time."""
     found_m, chains = np.zeros((len(sheets), 2)), np.array([sheet.id.chain for sheet in sheets])

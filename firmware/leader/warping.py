@@ -1,6 +1,7 @@
 """Taking estimated drift out of a sub-map's grid before it is matched."""
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,10 +38,11 @@ def remove_drift(
     rows = np.arange(low[0], grid.depth_m.shape[0] + high[0], dtype=np.float64)
     cols = np.arange(low[1], grid.depth_m.shape[1] + high[1], dtype=np.float64)
     row, col = np.meshgrid(rows, cols, indexing="ij")
-    time_s = _planar_time(grid, known, row, col)
+    time_at = _time_plane(grid, known)
+    time_s = time_at(row, col)
     for _ in range(_ITERATIONS):
         step = drift_mps[:, None, None] * (time_s - reference_time_s) / grid.cell_m
-        time_s = _planar_time(grid, known, row + step[0], col + step[1])
+        time_s = time_at(row + step[0], col + step[1])
     step = drift_mps[:, None, None] * (time_s - reference_time_s) / grid.cell_m
     source_row, source_col = row + step[0], col + step[1]
     if nearest:
@@ -80,15 +82,19 @@ def bilinear(values: Array, row: Array, col: Array) -> Array:
     return np.where(inside, total, np.nan)
 
 
-def _planar_time(grid: GriddedSubmap, known: NDArray[np.bool_], row: Array, col: Array) -> Array:
-    """Return the time of measurement from a plane fitted to the known cells.
+def _time_plane(grid: GriddedSubmap, known: NDArray[np.bool_]) -> Callable[[Array, Array], Array]:
+    """Return what tells the time of measurement by row and column: a plane through the known cells.
 
     Within forty seconds of straight track the time of a cell is a plane in its position to within
     the attitude; the plane also covers the margin where no cell is known.
     """
     i, j = np.nonzero(known)
     design = np.column_stack([np.ones(i.size), i, j])
-    plane = np.linalg.lstsq(design, grid.time_s[known], rcond=None)[0]
-    span = grid.time_s[known]
-    fitted = plane[0] + plane[1] * row + plane[2] * col
-    return np.asarray(np.clip(fitted, span.min(), span.max()))
+    known_s = grid.time_s[known]
+    plane = np.linalg.lstsq(design, known_s, rcond=None)[0]
+    first_s, last_s = known_s.min(), known_s.max()
+
+    def time_at(row: Array, col: Array) -> Array:
+        return np.asarray(np.clip(plane[0] + plane[1] * row + plane[2] * col, first_s, last_s))
+
+    return time_at

@@ -132,7 +132,7 @@ class Atlas:
         return self._sheets[sheet_id]
 
     def add(self, sheet: Sheet) -> None:
-        """Keep a sheet; a better version of a known one takes its place."""
+        """Keep a sheet; a later version of a known one takes its place."""
         if sheet.id in self._shelved:
             self._unshelve(sheet.id)
         self._sheets[sheet.id] = sheet

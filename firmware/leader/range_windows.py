@@ -104,8 +104,6 @@ class RangeWindows:
         if any(r.chain == chain and r.arrived_s == toa_s for r in self._held):
             self.counters["ranges_of_one_packet"] += 1
             return
-        if len(self._held) == self._held.maxlen:
-            self.counters["ranges_overwritten"] += 1
         sent_s = transmission_s(header.tx_second, toa_s)
         sender_m = depth_m if s.follower_depth_m is None else s.follower_depth_m
         speed_mps = s.sound_profile.speed_mps(sender_m, depth_m, s.sound_speed_mps)
@@ -117,6 +115,8 @@ class RangeWindows:
         if not horizontal_m(range_m, depth_difference_m) > 0.0:
             self.counters["ranges_too_steep"] += 1
             return
+        if len(self._held) == self._held.maxlen:
+            self.counters["ranges_overwritten"] += 1
         self._held.append(
             _HeldRange(
                 chain=chain,

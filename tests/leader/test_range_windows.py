@@ -127,3 +127,13 @@ def test_impossible_ranges_are_counted_and_not_held(late_s: float) -> None:
     ranging.hold(1, replace(paper_packet().header, tx_second=8), 8.0 + late_s, DEPTH_M)
     assert not ranging._held
     assert ranging.counters["ranges_impossible"] == 1
+
+
+def test_only_a_range_that_is_held_overwrites_another() -> None:
+    ranging = RangeWindows(RangeSettings(held=16))
+    _heard(ranging, 8, 136)
+    header = replace(paper_packet().header, tx_second=8)
+    ranging.hold(1, header, 136.0, DEPTH_M)
+    assert ranging.counters["ranges_overwritten"] == 0
+    ranging.hold(1, header, 136.4, DEPTH_M)
+    assert ranging.counters["ranges_overwritten"] == 1

@@ -33,7 +33,8 @@ def grid_of(bins: BinnedSoundings, cell_m: float) -> GriddedSubmap:
         depth_m = np.bincount(index, weight * np.tile(bins.depth_m, len(places)), size) / total
         time_s = np.bincount(index, weight * np.tile(bins.time_s, len(places)), size) / total
         variance_m2 = np.where(total > 0, 1.0 / total, np.nan)
-    depth_m[np.bincount(index, shares, size) < _LEAST_SHARE] = np.nan
+    beside = np.bincount(index, shares, size) < _LEAST_SHARE
+    depth_m[beside] = variance_m2[beside] = time_s[beside] = np.nan
     return GriddedSubmap(
         north0_m=float(north0 * cell_m),
         east0_m=float(east0 * cell_m),

@@ -27,3 +27,15 @@ def test_a_grid_has_no_holes_however_coarse_the_bins_are(bin_m: float) -> None:
     assert np.isfinite(grid.depth_m[inner]).all()
     assert np.abs(grid.depth_m - true_m)[inner].max() < 0.1
     assert grid.time_s[inner] == pytest.approx(5.0)
+
+
+def test_nothing_is_known_of_a_cell_beside_the_soundings() -> None:
+    rng = np.random.default_rng(4)
+    bins = SoundingBins(BinningSettings(cell_m=2.0))
+    north_m, east_m = rng.uniform(0.0, 60.0, (2, 6000))
+    bins.add(np.column_stack([north_m, east_m, np.full(6000, 40.0)]), 5.0)
+    grid = grid_of(bins.result(), 2.0)
+    known = np.isfinite(grid.depth_m)
+    assert 0 < np.count_nonzero(~known) < known.size
+    assert np.array_equal(np.isfinite(grid.variance_m2), known)
+    assert np.array_equal(np.isfinite(grid.time_s), known)

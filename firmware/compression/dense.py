@@ -197,7 +197,7 @@ def dense_points(
     if len(stream) < _HEAD.size:
         raise RemoteProtocolError(f"{len(bodies)} of {frames} fragments give no points")
     *values, north, east, rows, columns, count, place_code, depth_code = _HEAD.unpack_from(stream)
-    if not rows or not columns or count > _MOST_POINTS:
+    if not rows or not columns or not 1 <= count <= _MOST_POINTS:
         raise RemoteProtocolError(f"{count} points in {rows} x {columns} places")
     if place_code > 2 * _PLACE_EXPONENT or depth_code > 2 * _DEPTH_EXPONENT:
         raise RemoteProtocolError(f"steps of code {place_code} and {depth_code}")

@@ -161,6 +161,17 @@ def test_absurd_hyperparameters_of_dense_give_a_bounded_grid_or_one_error(
     bounded_or_refused(fragments_of(dense, dense_bodies(code, track_of(survey), 244, 10)))
 
 
+@pytest.mark.parametrize("count", [0, 1, 601, 65535])
+def test_an_absurd_count_of_points_gives_a_bounded_grid_or_one_error(
+    count: int, survey: Survey, dense: CompressedCode
+) -> None:
+    assert isinstance(dense.code, DenseCode)
+    stream = bytearray(dense.code.stream)
+    struct.pack_into(">H", stream, 28, count)
+    code = dataclasses.replace(dense.code, stream=bytes(stream))
+    bounded_or_refused(fragments_of(dense, dense_bodies(code, track_of(survey), 244, 10)))
+
+
 @pytest.mark.parametrize("value", [0, 1, 255])
 @pytest.mark.parametrize("place", range(24))
 def test_absurd_geometry_of_lattice_gives_a_bounded_grid_or_one_error(

@@ -14,7 +14,7 @@ try:
 except ImportError:
     sys.exit("fuzzing needs atheris; type: pip install -e '.[fuzz]'")
 
-with atheris.instrument_imports(include=["protocol"]):
+with atheris.instrument_imports(include=["protocol", "firmware.compression"]):
     from tests.fuzz.targets import TARGETS
 
 CORPUS = Path(__file__).parent / "corpus"

@@ -3,8 +3,13 @@
 import hashlib
 from pathlib import Path
 
+from firmware.compression import compress, packets_from
+from firmware.compression.packing import submap_header
+from firmware.compression.settings import CompressionSettings
 from protocol import vectors
 from protocol.codec import encode
+from protocol.packets import SubmapFragment
+from tests.compression.conftest import made_survey
 
 CORPUS = Path(__file__).parent / "corpus"
 SENTENCES = (
@@ -31,10 +36,25 @@ def seeds() -> dict[str, list[bytes]]:
         "seal": [frame[:-4] for frame in sealed],
         "line": lines,
         "reassembly": [bytes(range(0, 240)), bytes(600), b"\x01\x02\x03\x04\x09\x10" * 30],
+        "submap": bodies(),
         "nmea": [*SENTENCES, b"".join(SENTENCES)],
         "micromodem": [*SENTENCES, b"".join(SENTENCES)],
         "nanomodem": [*REPLIES, b"".join(REPLIES)],
     }
+
+
+def bodies() -> list[bytes]:
+    """Return what a sub-map's only frame carries, by profile."""
+    survey = made_survey()
+    packets = [
+        packets_from(
+            compress(survey.bins, CompressionSettings(frames=1, small_frames=small), profile),
+            survey.track,
+            submap_header(),
+        )[0]
+        for profile, small in (("dense", False), ("lattice", False), ("lattice", True))
+    ]
+    return [packet.body for packet in packets if isinstance(packet, SubmapFragment)]
 
 
 def main() -> None:

@@ -2,10 +2,13 @@
 
 from collections.abc import Callable
 
+import numpy as np
+
+from firmware.leader.reconstruction import ReconstructionSettings, reconstruct_packets
 from protocol import vectors
 from protocol.codec import decode, encode
 from protocol.crc import with_crc
-from protocol.errors import RemoteProtocolError
+from protocol.errors import EstimationError, RemoteProtocolError
 from protocol.framing import GUARD_BYTES, QUEUED_FRAMES, LineReader, wrap
 from protocol.modems.micromodem import MicroModem
 from protocol.modems.micromodem_settings import MicroModemSettings
@@ -19,6 +22,12 @@ from protocol.seal import Keys, Opener
 
 KEYS = Keys(vectors.SEAL_KEY)
 GENUINE = {frame[:-4] for frame, _ in vectors.sealed().values()}
+BODIES = {
+    Profile.SUBMAP_DENSE: 244,
+    Profile.SUBMAP_LATTICE: 244,
+    Profile.SUBMAP_LATTICE_SMALL: 50,
+}
+FEW_CELLS = ReconstructionSettings(max_cells=10_000)
 SMALL = ReassemblySettings(slots=3, remembered=4, queued_events=16)
 
 
@@ -104,6 +113,28 @@ def reassembly(data: bytes) -> None:
     assert handed_on == accepted == reassembler.counters.accepted
 
 
+def submap(data: bytes) -> None:
+    """Any bytes as the body of a sub-map's only frame: a bounded grid, or one error."""
+    for profile, size in BODIES.items():
+        header = Header(
+            profile=profile,
+            vehicle=1,
+            boot_epoch=0,
+            submap=0,
+            fragment=0,
+            fragment_count=1,
+            tx_second=0,
+            time_quarters=0,
+        )
+        fragment = SubmapFragment(header=header, body=data[:size].ljust(size, b"\x00"))
+        try:
+            grid = reconstruct_packets({0: fragment}, FEW_CELLS, 0.0).grid
+        except EstimationError:
+            continue
+        assert grid.depth_m.size <= FEW_CELLS.max_cells
+        assert not np.isinf(grid.depth_m).any()
+
+
 def nmea(data: bytes) -> None:
     """Any bytes through the Micro-Modem's line parser, whole and byte by byte alike."""
     whole, pieces = SentenceReader(), SentenceReader()
@@ -153,6 +184,7 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
     "seal": seal,
     "line": line,
     "reassembly": reassembly,
+    "submap": submap,
     "nmea": nmea,
     "micromodem": micromodem,
     "nanomodem": nanomodem,

@@ -27,7 +27,7 @@ from protocol.errors import (
     LocalProtocolError,
     RemoteProtocolError,
 )
-from protocol.packets import Answer, ExtendedAnswer, SealedFrame
+from protocol.packets import SIZE_BYTES, Answer, ExtendedAnswer, SealedFrame
 from protocol.schedule import Slots, Turns
 from protocol.timestamps import from_quarters, is_arrival, to_quarters, transmission_s
 from protocol.vehicles import BOOT_EPOCHS, LEADER
@@ -202,12 +202,12 @@ class FollowerCore:
         self._track.clear()
 
     def _begin_fit(self, submap: Submap) -> None:
-        if self._fit is not None:
-            self.counters["fits_cut_short"] += 1
-            self._end_fit()
         if submap.bins.depth_m.size < self._settings.submaps.minimum_cells:
             self.counters["submaps_too_thin"] += 1
             return
+        if self._fit is not None:
+            self.counters["fits_cut_short"] += 1
+            self._end_fit()
         self._last_submap_s = float(submap.track.time_s[-1])
         steps = compress_steps(submap.bins, self._compression, self._settings.profile)
         self._fit = _Fit(submap=submap, steps=steps)
@@ -216,8 +216,8 @@ class FollowerCore:
         fit, self._fit = self._fit, None
         if fit is None:
             return
-        if fit.best is None:
-            self.counters["submaps_unfit"] += 1
+        if fit.best is None or SIZE_BYTES[fit.best.profile] > self._settings.frame_bytes:
+            self.counters["submaps_unfit"] += 1  # what there is before a fit has the paper's size
             return
         self.counters["failed_factorisations"] += fit.best.report.failed_factorisations
         self.counters["fits_stopped_early"] += not fit.best.report.settled

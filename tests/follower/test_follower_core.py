@@ -122,6 +122,40 @@ def test_a_survey_beyond_what_frames_can_tell_is_counted_and_goes_on() -> None:
     assert core.status()["submaps_unfit"] >= 1
 
 
+SMALL: dict[str, Any] = {"profile": "lattice", "compression.small_frames": True}
+
+
+def test_a_thin_submap_leaves_the_fit_before_it_alone() -> None:
+    core = follower_of(PATH, **SMALL)
+    sent(core, 12.0)
+    for quarter in range(4 * 12 + 1, 4 * 40):  # over a bottom that the log has lost
+        core.receive_odometry(
+            Odometry(
+                time_s=quarter / 4.0,
+                velocity_north_mps=np.nan,
+                velocity_east_mps=np.nan,
+                yaw_rad=0.0,
+                depth_m=10.0,
+            )
+        )
+        core.tick(quarter / 4.0)
+    assert core.status()["submaps_too_thin"] == 1
+    assert core.status()["submaps_sent"] == 1
+    assert not core.counters["fits_cut_short"]
+
+
+def test_a_fit_cut_short_sends_no_frame_larger_than_the_modem_carries() -> None:
+    core = follower_of(PATH, **SMALL, steps_per_tick=1)
+    for quarter in range(1, 4 * 45):
+        sail(core, PATH, quarter / 4.0)
+        if quarter % 4 == 0:
+            core.tick(quarter / 4.0)
+    frames = [encode(packet) for packet in sent(core, 80.0, 45.0)]
+    assert core.status()["fits_cut_short"] >= 1
+    assert core.status()["submaps_unfit"] >= 1
+    assert {len(frame) for frame in frames} == {62}
+
+
 def test_paper_profile_in_shared_air_leaves_whole_submaps_out() -> None:
     core = follower_of(PATH, slots=slots_of(2), profile="paper")
     packets = [p for p in sent(core, 200.0) if isinstance(p, SubmapPacket)]

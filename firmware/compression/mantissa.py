@@ -23,6 +23,7 @@ from firmware.compression.results import PAPER_FRAGMENTS, PAPER_POINTS
 from firmware.geometry import Array
 from protocol.erasure import cauchy, multiply, parity_of, recovered
 from protocol.errors import RemoteProtocolError
+from protocol.packets import DEEPEST_M, HIGHEST_M
 
 _FLAG_BITS = np.uint32(0x3F)
 _BITS = (11, 11, 12)  # of north, east and depth index
@@ -99,7 +100,8 @@ def without_parity(points_ned_m: NDArray[np.float32] | Array, steps: Steps) -> A
 def completed(fragments: Mapping[int, Float32], mean_depth_m: np.float32) -> tuple[Array, int]:
     """Return all points (M, 3) to be had from fragments (15, 3), and how many were recovered.
 
-    Without parity, or when too little of it arrived, these are the points that arrived.
+    Without parity, or when too little of it arrived, or about a mean depth that none is, these are
+    the points that arrived.
     """
     arrived = [np.asarray(fragments[i], dtype=np.float64) for i in sorted(fragments)]
     points = np.concatenate(arrived)
@@ -107,6 +109,7 @@ def completed(fragments: Mapping[int, Float32], mean_depth_m: np.float32) -> tup
     usable = all(0 <= i < PAPER_FRAGMENTS for i in fragments) and len(points) == (
         PAPER_POINTS * len(fragments)
     )
+    usable &= bool(HIGHEST_M <= mean_depth_m <= DEEPEST_M)
     if steps is None or not usable or not np.isfinite(points).all():
         return points, 0
     if np.abs(points / steps.sizes_m).max() > 4 * _REACH:

@@ -8,7 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware.compression import bitplanes, compress, compress_steps, packets_from
-from firmware.compression.mantissa import completed, fitting_steps, flagged, with_parity
+from firmware.compression.mantissa import (
+    completed,
+    fitting_steps,
+    flagged,
+    steps_of,
+    with_parity,
+)
 from firmware.compression.packing import submap_header
 from firmware.compression.settings import CompressionSettings
 from firmware.compression.steps import run
@@ -85,6 +91,17 @@ def test_five_lost_packets_leave_the_points_that_came() -> None:
     wired = with_parity(POINTS, steps).reshape(10, 15, 3)
     points, recovered = completed({i: wired[i] for i in range(5)}, flagged(40.0, steps))
     assert (len(points), recovered) == (75, 0)
+
+
+@pytest.mark.parametrize("bits", [0x7FC00001, 0x7F800001, 0x7F000001, 0x7F000003])
+def test_parity_about_no_mean_depth_leaves_the_points_that_came(bits: int) -> None:
+    """The bits that tell of parity stand in any number, NaN and 1e38 m among them."""
+    mean_m = np.uint32(bits).view(np.float32)
+    steps = steps_of(mean_m)
+    assert steps is not None
+    wired = with_parity(POINTS, steps).reshape(10, 15, 3)
+    points, recovered = completed({i: wired[i] for i in range(7)}, mean_m)
+    assert (len(points), recovered) == (105, 0)
 
 
 def test_points_of_another_sender_with_the_flag_by_chance_are_left_alone() -> None:

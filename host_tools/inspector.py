@@ -21,6 +21,7 @@ from protocol.packets import (
     SubmapFragment,
     SubmapPacket,
     TrajectoryPacket,
+    usable_points,
     usable_states,
 )
 
@@ -133,7 +134,7 @@ def _content(packet: Packet) -> str:
     match packet:
         case SubmapPacket():
             states = int(usable_states(packet.trajectory).sum())
-            points = int(packet.usable_points.sum())
+            points = int(usable_points(packet.points_ned_m).sum())
             b, c, sigma2_m2, mean_m = (float(value) for value in packet.hyperparameters)
             return (
                 f"{states} states, {points} points, b {b:.4g}, c {c:.4g}, "

@@ -166,6 +166,20 @@ def usable_states(states: NDArray[np.floating]) -> NDArray[np.bool_]:
     return np.asarray(np.isfinite(states).all(axis=1) & near.all(axis=1))
 
 
+def usable_points(points_ned_m: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Return (M,) which of the points (M, 3) north, east, depth are within any survey's bounds."""
+    near = np.abs(points_ned_m[:, :2]) <= FARTHEST_M
+    depth_m = points_ned_m[:, 2]
+    return np.asarray(near.all(axis=1) & (depth_m >= HIGHEST_M) & (depth_m <= DEEPEST_M))
+
+
+def usable_hyperparameters(hyperparameters: NDArray[np.floating]) -> bool:
+    """Return whether hyperparameters (4,) mean something."""
+    b, c, _, mean_depth_m = hyperparameters.tolist()
+    is_finite = bool(np.isfinite(hyperparameters).all())
+    return is_finite and b != 0.0 and c != 0.0 and HIGHEST_M <= mean_depth_m <= DEEPEST_M
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SubmapPacket(_BitwiseEqual):
     """One of the paper's ten packets: a slice of trajectory, 15 pseudo points, hyperparameters.
@@ -182,15 +196,6 @@ class SubmapPacket(_BitwiseEqual):
     trajectory: Array32
     points_ned_m: Array32
     hyperparameters: Array32
-
-    @property
-    def usable_points(self) -> NDArray[np.bool_]:
-        """Return (M,) which points are finite and within any survey's bounds."""
-        points = self.points_ned_m
-        near = (np.abs(points[:, :2]) <= FARTHEST_M).all(axis=1)
-        depth_m = points[:, 2]
-        plausible = (depth_m >= HIGHEST_M) & (depth_m <= DEEPEST_M)
-        return np.asarray(np.isfinite(points).all(axis=1) & near & plausible)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware.geometry import Array
+from protocol.packets import DEEPEST_M, HIGHEST_M
 
 FloatArray = NDArray[Any]  # float32 for rows over soundings, float64 among points
 _ROWS = 64  # at once where no room is given: matrices among points need none of their own size
@@ -156,7 +157,10 @@ class Hyperparameters:
 
     @classmethod
     def from_wire(cls, values: Array, fallback_depth_m: float) -> "Hyperparameters":
-        """Return what the four numbers say, held within bounds whatever they are."""
+        """Return what the four numbers say, held within bounds; for what means nothing, usual ones.
+
+        A mean depth that means nothing is the fallback.
+        """
         b, c, sigma2, mean_m = (float(value) for value in np.asarray(values, dtype=np.float64))
         kernel = Kernel.SQUARED_EXPONENTIAL
         if c < 0.0:
@@ -164,10 +168,10 @@ class Hyperparameters:
         elif b < 0.0:
             kernel = Kernel.MATERN32
         return cls(
-            b_per_m=_held(abs(b), 1e-4, 1e2, 0.1),
-            c_m2=_held(abs(c), 1e-8, 1e6, 1.0),
+            b_per_m=_held(abs(b) or np.nan, 1e-4, 1e2, 0.1),
+            c_m2=_held(abs(c) or np.nan, 1e-8, 1e6, 1.0),
             sigma2_m2=_held(abs(sigma2), 0.0, 1e6, 0.02),
-            mean_depth_m=mean_m if abs(mean_m) < 2e4 else fallback_depth_m,
+            mean_depth_m=mean_m if HIGHEST_M <= mean_m <= DEEPEST_M else fallback_depth_m,
             kernel=kernel,
             noise_applied=sigma2 < 0.0,
         )

@@ -117,13 +117,15 @@ def lattice_map(bodies: dict[int, bytes], track_bytes: int, frames: int) -> Latt
     except CodeEnd as end:
         raise RemoteProtocolError("the stream ends within its footprint") from end
     protection = Protection.from_bytes(next(iter(bodies.values())))
-    reached = sum(k <= len(bodies) for k in protection.thresholds)
+    variance_m2 = variances[sum(k <= len(bodies) for k in protection.thresholds) - 1]
+    if not np.isfinite(variance_m2):
+        raise RemoteProtocolError(f"{len(bodies)} of {frames} fragments give no map")
     return LatticeMap(
         frame=frame,
         trend=trend,
         mask=mask,
         coefficients_m=bitplanes.decode(frame.shape, decoder),
-        variance_m2=variances[reached - 1],
+        variance_m2=variance_m2,
     )
 
 
@@ -252,4 +254,4 @@ def _variance_code(variance_m2: float) -> int:
 
 
 def _variance_of(code: int) -> float:
-    return float(1e-4 * 2.0 ** (code / 12.0))
+    return float("inf") if code == 255 else float(1e-4 * 2.0 ** (code / 12.0))

@@ -26,7 +26,15 @@ from firmware.leader.gridding import gridded
 from firmware.submaps import GriddedSubmap, Track
 from protocol.errors import EstimationError, RemoteProtocolError
 from protocol.lattice import PROTECTION_BYTES
-from protocol.packets import SEAL_BYTES, Profile, SubmapFragment, SubmapPacket, usable_states
+from protocol.packets import (
+    SEAL_BYTES,
+    Profile,
+    SubmapFragment,
+    SubmapPacket,
+    usable_hyperparameters,
+    usable_points,
+    usable_states,
+)
 from protocol.settings import Settings, setting
 from protocol.timestamps import from_quarters
 
@@ -89,9 +97,11 @@ def reconstruct_packets(
             {i: p for i, p in fragments.items() if isinstance(p, SubmapFragment)}, settings, near_s
         )
     parts = {packet.header.fragment: packet.points_ned_m for packet in packets}
-    points_ned_m, recovered = completed(parts, packets[0].hyperparameters[3])
+    told = [p.hyperparameters for p in packets]
+    hyperparameters = next(filter(usable_hyperparameters, told), told[0])
+    points_ned_m, recovered = completed(parts, hyperparameters[3])
     track = track_of_packets(packets, near_s)
-    grid = reconstruct_points(points_ned_m, packets[0].hyperparameters, track, settings)
+    grid = reconstruct_points(points_ned_m, hyperparameters, track, settings)
     return Reconstruction(grid=grid, track=track, recovered_points=recovered)
 
 
@@ -183,9 +193,7 @@ def reconstruct_points(
         When fewer than three points are usable, or they lie on one line.
     """
     points = np.asarray(points_ned_m, dtype=np.float64)[:_MAX_POINTS]
-    with np.errstate(invalid="ignore"):
-        good = np.isfinite(points).all(axis=1) & (np.abs(points) < 1e6).all(axis=1)
-    points = points[good]
+    points = points[usable_points(points)]
     if len(points) < 3:
         raise EstimationError(f"{len(points)} usable points; a hull needs three")
     hyper = Hyperparameters.from_wire(

@@ -149,6 +149,50 @@ def test_absurd_hyperparameters_of_paper_give_a_bounded_grid_or_one_error(
     bounded_or_refused(frames)
 
 
+@pytest.mark.parametrize(
+    ("place", "value"), [(0, 0.0), (1, 0.0), (2, np.nan), (3, 15_000.0), (3, np.nan)]
+)
+def test_hyperparameters_that_mean_nothing_are_those_of_another_fragment(
+    place: int, value: float, survey: Survey, paper: Compressed
+) -> None:
+    frames = received(through_the_wire(paper, survey))
+    meant = reconstruct_packets(frames, BOUNDS, 0.0).grid
+    first = frames[0]
+    assert isinstance(first, SubmapPacket)
+    hyperparameters = first.hyperparameters.copy()
+    hyperparameters[place] = value
+    frames[0] = dataclasses.replace(first, hyperparameters=hyperparameters)
+    grid = reconstruct_packets(frames, BOUNDS, 0.0).grid
+    assert np.array_equal(grid.depth_m, meant.depth_m, equal_nan=True)
+    assert np.array_equal(grid.variance_m2, meant.variance_m2, equal_nan=True)
+
+
+@pytest.mark.parametrize("depth_m", [-101.0, 500_000.0])
+def test_a_point_at_a_depth_that_is_none_is_left_out(depth_m: float, survey: Survey) -> None:
+    """As in the packets of a sender without parity; one point alone would pull all cells."""
+    paper = compress(survey.bins, dataclasses.replace(QUICK, parity=False), "paper")
+    frames = received(through_the_wire(paper, survey))
+    first = frames[0]
+    assert isinstance(first, SubmapPacket)
+    points_ned_m = first.points_ned_m.copy()
+    points_ned_m[0, 2] = depth_m
+    frames[0] = dataclasses.replace(first, points_ned_m=points_ned_m)
+    wide = dataclasses.replace(BOUNDS, max_variance_m2=1e4)
+    depths_m = reconstruct_packets(frames, wide, 0.0).grid.depth_m
+    assert np.nanmin(depths_m) > 30.0
+    assert np.nanmax(depths_m) < 50.0
+
+
+def test_a_lattice_of_no_variance_is_no_map(survey: Survey, lattice: CompressedCode) -> None:
+    assert isinstance(lattice.code, LatticeCode)
+    bodies = lattice_bodies(lattice.code, track_of(survey), 244, 1, lattice.settings)
+    body = bytearray(bodies[0])
+    variances = 4 + len(track_of(survey)) + 20
+    body[variances : variances + 3] = b"\xff\xff\xff"
+    with pytest.raises(EstimationError, match="no map"):
+        reconstruct_packets(fragments_of(lattice, [bytes(body)]), BOUNDS, 0.0)
+
+
 @pytest.mark.parametrize("place", range(4))
 @pytest.mark.parametrize("value", ABSURD)
 def test_absurd_hyperparameters_of_dense_give_a_bounded_grid_or_one_error(

@@ -22,6 +22,7 @@ from protocol.packets import (
     SubmapPacket,
     TrajectoryPacket,
     answer_count,
+    usable_points,
 )
 from tests.protocol.strategies import packets, paper_packet
 
@@ -199,7 +200,7 @@ def test_unused_and_absurd_points_are_told_from_usable_ones() -> None:
     points[2, 0] = 2.0e6
     points[3, 2] = 20_000.0
     packet = replace(packet, points_ned_m=points)
-    assert packet.usable_points.tolist() == [False] * 4 + [True] * 11
+    assert usable_points(packet.points_ned_m).tolist() == [False] * 4 + [True] * 11
 
 
 def test_packets_compare_by_bits_and_hash_alike() -> None:

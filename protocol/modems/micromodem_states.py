@@ -1,8 +1,9 @@
 """The Micro-Modem conversation as one table: state and trigger to action and next state.
 
 A trigger is the name of a sentence, or one of: `start` (port there), `silence` (the wait of a dump
-is over), `done` (an action finished its list), `gone` (no answer after all tries), `refused` (an
-error line or a wrong echo), `restarted` (the modem says so). An unlisted pair changes nothing.
+is over), `done` (an action finished its list), `nothing` (no frame may go), `gone` (no answer after
+all tries), `refused` (an error line or a wrong echo), `restarted` (the modem says so). An unlisted
+pair changes nothing.
 """
 
 import enum
@@ -106,6 +107,7 @@ TABLE: dict[tuple[State, str], Row] = {
     (State.ASKING_ALIVE, "CACFG"): ("check_address", State.ASKING_ALIVE),
     (State.ASKING_ALIVE, "done"): ("rest", State.IDLE),
     (State.ASKING_ALIVE, "wrong"): ("ask_dump", State.DUMPING),
+    (State.CYCLE_ASKED, "nothing"): ("rest", State.IDLE),
     (State.CYCLE_ASKED, "CACYC"): ("rest", State.LOADING),
     (State.CYCLE_ASKED, "CADRQ"): ("load_frame", State.LOADING),
     (State.CYCLE_ASKED, "refused"): ("refuse_packet", State.IDLE),
@@ -113,6 +115,7 @@ TABLE: dict[tuple[State, str], Row] = {
     (State.LOADING, "done"): ("rest", State.LOADED),
     (State.LOADING, "refused"): ("refuse_packet", State.IDLE),
     (State.LOADING, "late"): ("note_late", State.IDLE),
+    (State.FLEXIBLE_ASKED, "nothing"): ("rest", State.IDLE),
     (State.FLEXIBLE_ASKED, "CATDP"): ("check_flexible", State.FLEXIBLE_ASKED),
     (State.FLEXIBLE_ASKED, "done"): ("rest", State.LOADED),
     (State.FLEXIBLE_ASKED, "refused"): ("refuse_flexible", State.IDLE),

@@ -1,8 +1,8 @@
 """A Micro-Modem at work: packets out on whole seconds, packets in, pings and mini-packets.
 
 A packet is planned for a second, and begun so early that its last frame is loaded just before
-that second. Frames get the second stamped when the modem asks for them; one asked for too late is
-kept back, the modem gives the cycle up, and the frames go again with another second.
+that second. Frames get the second stamped when the packet is begun; one asked for too late is kept
+back, the modem gives the cycle up, and the frames go again with another second.
 """
 
 import math
@@ -121,9 +121,10 @@ class Traffic(Setup):
 
     # ---- actions of the data cycle
 
-    def ask_cycle(self, sentence: Sentence, now_s: float) -> None:  # noqa: ARG002
+    def ask_cycle(self, sentence: Sentence, now_s: float) -> str | None:  # noqa: ARG002
         """Begin a data cycle for the lent frames."""
-        self._stamped = {}
+        if not self._stamp_lent():
+            return "nothing"
         self._say(
             encode(
                 "CCCYC",
@@ -136,9 +137,10 @@ class Traffic(Setup):
             ),
             now_s,
         )
+        return None
 
     def load_frame(self, sentence: Sentence, now_s: float) -> str | None:
-        """Answer a data request with its frame, stamped with the second of its start."""
+        """Answer a data request with its frame."""
         number = integer(sentence.fields[5], 0) if len(sentence.fields) >= 6 else 0
         if not number or integer(sentence.fields[1]) != self.settings.address:
             return None
@@ -153,7 +155,6 @@ class Traffic(Setup):
         if number == len(self.outbox.lent) and now_s < due_s:
             self._do_later(due_s, lambda then_s: self._fire("CADRQ", sentence, then_s))
             return None
-        self._stamped[number] = self._stamp(self.outbox.lent[number - 1].frame, self._start_s)
         self._say(self._data_line(self._stamped[number]), now_s)
         return "done" if number == len(self.outbox.lent) else None
 
@@ -161,14 +162,16 @@ class Traffic(Setup):
         """Answer a data request beyond our frames: there is no more."""
         self._say(self._data_line(b""), now_s)
 
-    def send_flexible(self, sentence: Sentence, now_s: float) -> None:  # noqa: ARG002
+    def send_flexible(self, sentence: Sentence, now_s: float) -> str | None:  # noqa: ARG002
         """Send the lent frame as one flexible packet."""
-        self._stamped = {1: self._stamp(self.outbox.lent[0].frame, self._start_s)}
+        if not self._stamp_lent():
+            return "nothing"
         settings = self.settings
         destination, acknowledge = settings.destination, int(settings.acknowledge)
         digits = self._stamped[1].hex().upper()
         line = encode("CCTDP", destination, settings.flexible_rate, acknowledge, 0, digits)
         self._say(line, now_s)
+        return None
 
     def check_flexible(self, sentence: Sentence, now_s: float) -> str | None:  # noqa: ARG002
         """Take the modem's word on a flexible packet: error 0 is none."""
@@ -213,6 +216,11 @@ class Traffic(Setup):
             return "dead"
         self.refuse_packet(sentence, now_s)
         return None
+
+    def _stamp_lent(self) -> bool:
+        """Stamp the lent frames with the second of their start; return whether any may go."""
+        self._stamped = dict(enumerate(self.outbox.stamped(self._stamp, self._start_s), 1))
+        return bool(self._stamped)
 
     # ---- pings and mini-packets
 

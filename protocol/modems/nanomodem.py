@@ -279,13 +279,15 @@ class Nanomodem:
         self._started_s = now_s
         self._output += b"$%s%03d" % (command.encode("ascii"), self._peer)
 
-    def _send_frame(self, reply: Reply, now_s: float) -> None:  # noqa: ARG002
-        item = self.outbox.lend(1, FRAME_BYTES)[0]
+    def _send_frame(self, reply: Reply, now_s: float) -> str | None:  # noqa: ARG002
+        (item,) = self.outbox.lend(1, FRAME_BYTES)
+        stamped = self.outbox.stamped(self._stamp, now_s)
+        if not stamped:
+            return "nothing"
         settings, self._is_frame, self._started_s = self.settings, True, now_s
         if item.attempts == 0:
             self._sequence = (self._sequence + 1) % 256
-        frame = self._stamp(item.frame, now_s)
-        self._payload = bytes([settings.address, self._sequence]) + frame
+        self._payload = bytes([settings.address, self._sequence]) + stamped[0]
         self._peer = settings.destination
         self._awaits_answer = settings.acknowledge and settings.destination != BROADCAST
         size = len(self._payload)
@@ -294,6 +296,7 @@ class Nanomodem:
         else:
             kind = b"M" if self._awaits_answer else b"U"
             self._output += b"$%s%03d%02d" % (kind, settings.destination, size) + self._payload
+        return None
 
     def _note_echo(self, reply: Reply, now_s: float) -> None:  # noqa: ARG002
         self._deadline_s = now_s + airtime_s(len(self._payload)) + AIR_MARGIN_S

@@ -49,6 +49,7 @@ TABLE: dict[tuple[State, str], tuple[str, State]] = {
     (State.ASKING_QUALITY, "$C"): ("note_quality", State.IDLE),
     (State.ASKING_QUALITY, "E"): ("rest", State.IDLE),
     (State.ASKING_QUALITY, "gone"): ("fail", State.IDLE),
+    (State.SPEAKING, "nothing"): ("rest", State.IDLE),
     (State.SPEAKING, "echo"): ("note_echo", State.ON_AIR),
     (State.SPEAKING, "E"): ("refuse", State.IDLE),
     (State.SPEAKING, "gone"): ("fail", State.IDLE),

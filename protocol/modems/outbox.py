@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from itertools import islice, takewhile
 
 from protocol.modems.events import FrameDropped
+from protocol.modems.stamping import Stamp
 
 MOST_ATTEMPTS = 8
 """A frame that a living modem failed to send this often is itself the fault."""
@@ -58,6 +59,15 @@ class Outbox:
         for _ in self.lent:
             self._waiting.popleft()
         return self.lent
+
+    def stamped(self, stamp: Stamp, start_s: float) -> list[bytes]:
+        """Return the lent frames as they go on the air; one that must not is dropped."""
+        frames = [(item, stamp(item.frame, start_s)) for item in self.lent]
+        self.lent = tuple(item for item, frame in frames if frame is not None)
+        for item, frame in frames:
+            if frame is None:
+                self._drop(item, "it cannot be sealed")
+        return [frame for _, frame in frames if frame is not None]
 
     def confirm(self) -> tuple[Outgoing, ...]:
         """Return the lent frames, which have left for good."""

@@ -46,10 +46,9 @@ class SealedLink:
             self.counters["not_sealed"] += 1
             return None
 
-    def stamp(self, frame: bytes, start_s: float) -> bytes:
+    def stamp(self, frame: bytes, start_s: float) -> bytes | None:
         """Return a core's frame as it is sealed by a driver that knows the second of its start."""
-        stamped = stamp_frame(frame, start_s)
-        return self.seal(stamped) or b""
+        return self.seal(stamp_frame(frame, start_s))
 
     def open(self, frame: bytes) -> bytes | None:
         """Return the plain frame in a sealed one, None for all else."""

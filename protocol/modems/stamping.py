@@ -6,8 +6,9 @@ from protocol.codec import restamp
 from protocol.errors import ProtocolError
 from protocol.timestamps import to_tx_second
 
-Stamp = Callable[[bytes, float], bytes]
-"""(frame, start_s) to the frame that goes on the air; a sealing sender passes its own."""
+Stamp = Callable[[bytes, float], bytes | None]
+"""(frame, start_s) to the frame that goes on the air, None for one that must not; a sealing sender
+passes its own."""
 
 
 def stamp_frame(frame: bytes, start_s: float) -> bytes:

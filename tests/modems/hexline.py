@@ -58,8 +58,9 @@ class HexLine:
         first = self.outbox.first()
         if self.outbox.lent or first is None or first.ready_s > now_s:
             return b""
-        (item,) = self.outbox.lend(1, self.frame_bytes)
-        return self._stamp(item.frame, now_s).hex().encode() + b"\n"
+        self.outbox.lend(1, self.frame_bytes)
+        stamped = self.outbox.stamped(self._stamp, now_s)
+        return b"".join(frame.hex().encode() + b"\n" for frame in stamped)
 
     def next_event(self) -> DialectEvent | None:
         return self._events.popleft() if self._events else None

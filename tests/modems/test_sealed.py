@@ -1,15 +1,20 @@
 """A modem behind a seal: the cores on both sides see plain frames, and only the peer's."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
+from host_tools.emulators.rig import Rig
 from protocol.acoustics import Water, WaterSettings
 from protocol.codec import decode, encode
 from protocol.errors import LocalProtocolError
 from protocol.modems.base import LinkNotice, Modem, Reception
+from protocol.modems.events import FrameDropped
 from protocol.modems.loopback import LoopbackMedium
+from protocol.modems.micromodem_settings import MicroModemSettings
 from protocol.modems.sealed import SealedLink, SealedModem
 from protocol.packets import (
     Header,
@@ -21,10 +26,11 @@ from protocol.packets import (
 )
 from protocol.seal import Keys, Opener, Sealer
 from protocol.timestamps import to_tx_second
-from tests.modems.rigs import micro_rig
+from tests.modems.rigs import micro_rig, nano_rig
 from tests.modems.test_scars import answer, frames_of
 from tests.protocol.strategies import paper_packet
 
+cycles_rig = partial(micro_rig, settings=MicroModemSettings(flexible=False))
 KEYS = Keys(bytes(range(32)))
 
 
@@ -153,7 +159,7 @@ def test_a_driver_that_stamps_seals_with_the_second_of_its_start() -> None:
 
 
 def test_a_seal_without_counter_gives_the_driver_nothing_to_send() -> None:
-    assert link(1, Count(last=0)).stamp(encode(trajectory()), 5.0) == b""
+    assert link(1, Count(last=0)).stamp(encode(trajectory()), 5.0) is None
 
 
 @pytest.mark.parametrize("vehicle", [0, 1])
@@ -182,3 +188,21 @@ def test_a_driver_with_a_lead_is_given_plain_frames_and_its_notices_pass() -> No
     events = iter([notice, None])
     inner.next_event = lambda: next(events)  # type: ignore[method-assign]
     assert follower.next_event() is notice
+
+
+@pytest.mark.parametrize("make_rig", [micro_rig, cycles_rig, nano_rig])
+def test_a_frame_without_a_counter_never_reaches_the_modem(make_rig: Callable[[], Rig]) -> None:
+    rig = make_rig()
+    rig.cores[1]._stamp = link(1, Count(last=0)).stamp  # type: ignore[attr-defined]
+    rig.cores[1].send(answer(), rig.now_s)
+    rig.run_until(rig.now_s + 8.0)
+    status = rig.cores[1].status()
+    assert (status["dropped"], status["confirmed"], status["failures"]) == (1, 0, 0)
+    assert rig.taken(1, FrameDropped) == [
+        FrameDropped(frame=answer(), reason="it cannot be sealed")
+    ]
+    assert not sum(rig.bench.fates.values())
+    rig.cores[1]._stamp = link(1).stamp  # type: ignore[attr-defined]
+    rig.cores[1].send(answer(), rig.now_s)
+    rig.run_until(rig.now_s + 8.0)
+    assert len(frames_of(rig, 2)) == 1

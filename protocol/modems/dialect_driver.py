@@ -49,6 +49,9 @@ REQUESTS_CAP = 16
 EVENTS_CAP = 512
 """Cap of a core's events that nobody fetches: a minute of rate 5 is about 200; older ones go."""
 
+SET_BACK_S = 1.0
+"""A clock that is set back by less only makes what waits for a time wait longer by as much."""
+
 S = TypeVar("S", bound=Settings)
 
 
@@ -88,7 +91,7 @@ class Core(Protocol):
         """Ask for a two-way range."""
 
     def lost(self, now_s: float) -> None:
-        """Note that the port is gone."""
+        """Note that the port is gone or the clock was set back: nothing waits for a time now."""
 
     def status(self) -> dict[str, int]:
         """Return every counter."""
@@ -100,7 +103,7 @@ class DialectDriver:
     def __init__(self, core: Core, port: SerialPort, tap: Tap | None = None) -> None:
         self.core, self._port, self._tap = core, port, tap
         self._identification = Identification(core.name, port.path, port.baud)
-        self._was_open = True
+        self._was_open, self._polled_s = True, float("-inf")
         self._events: deque[ModemEvent] = deque()
         self._reports: deque[DialectEvent] = deque(maxlen=QUEUED_EVENTS)
         self._received = self._dropped_in = 0
@@ -143,7 +146,14 @@ class DialectDriver:
         self.core.send(frame, now_s, start_s)
 
     def poll(self, now_s: float) -> None:
-        """Move bytes both ways; never blocks, never raises."""
+        """Move bytes both ways; never blocks, never raises.
+
+        A clock that was set back leaves the modem's own wrong, and whatever waits for a time: the
+        conversation begins again.
+        """
+        if now_s < self._polled_s - SET_BACK_S:
+            self._lose(now_s)
+        self._polled_s = now_s
         if self._port.try_reopen(now_s):
             self._notice(f"{self._port.path} is back", now_s)
         data = self._port.read(now_s)
@@ -159,8 +169,7 @@ class DialectDriver:
             output += self._identification.poll(now_s, identified=self.core.identified)
             self._port.write(output, now_s)
         if self._was_open and not self._port.is_open:
-            self._report("lost", b"", now_s)
-            self.core.lost(now_s)
+            self._lose(now_s)
             why = self._port.last_error
             self._notice(f"{self._port.path} has gone ({why}); waiting for it", now_s)
         self._was_open = self._port.is_open
@@ -196,6 +205,10 @@ class DialectDriver:
         self._port.close()
         self._was_open = False
 
+    def _lose(self, now_s: float) -> None:
+        self._report("lost", b"", now_s)
+        self.core.lost(now_s)
+
     def _sort(self, event: DialectEvent, now_s: float) -> None:
         match event:
             case FrameHeard():
@@ -224,7 +237,7 @@ class DialectDriver:
 
     def _notice(self, text: str, now_s: float) -> None:
         same = text == self._last_notice.text
-        if same and now_s - self._last_notice.at_s < REPEAT_NOTICE_S:
+        if same and abs(now_s - self._last_notice.at_s) < REPEAT_NOTICE_S:
             return
         self._last_notice = LinkNotice(text=text, at_s=now_s)
         self._push(self._last_notice)

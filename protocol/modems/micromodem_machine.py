@@ -66,9 +66,12 @@ class Machine:
         return self._events.popleft() if self._events else None
 
     def lost(self, now_s: float) -> None:
-        """Note that the port is gone: what was on its way is queued again, all is asked anew."""
+        """Begin again: what was on its way is queued again, all is asked anew at once."""
         self.reader.clear()
         self._output.clear()
+        self._events.extend(self.packet.finish(None, now_s))
+        self.outbox.recall(now_s)
+        self._heard_s = now_s
         self._fire("lost", NOTHING, now_s)
 
     def status(self) -> dict[str, int]:

@@ -142,10 +142,6 @@ class Setup(Machine):
         self.outbox.give_back(blame=False)
         self._events.append(ModemRestarted(at_s=now_s))
 
-    def requeue(self, sentence: Sentence, now_s: float) -> None:  # noqa: ARG002
-        """Take back what was on its way."""
-        self.outbox.give_back(blame=False)
-
     def declare_dead(self, sentence: Sentence, now_s: float) -> None:
         """Begin again with the first question, asked once a second until something answers."""
         self.counters["deaths"] += 1

@@ -135,7 +135,7 @@ for _state in (State.CYCLE_ASKED, State.LOADING, State.FLEXIBLE_ASKED, State.LOA
     TABLE[_state, "gone"] = ("fail_packet", State.IDLE)
 for _state in _UP:
     TABLE[_state, "restarted"] = ("restart", State.BOOTING)
-    TABLE[_state, "lost"] = ("requeue", State.CLOSED)
+    TABLE[_state, "lost"] = ("rest", State.CLOSED)
     TABLE[_state, "dead"] = ("declare_dead", State.LISTENING)
     TABLE.setdefault((_state, "gone"), ("declare_dead", State.LISTENING))
-TABLE[State.LISTENING, "lost"] = ("requeue", State.CLOSED)
+TABLE[State.LISTENING, "lost"] = ("rest", State.CLOSED)

@@ -63,6 +63,11 @@ class Traffic(Setup):
         self._start_s, self._extra_lead_s = 0.0, 0.0
         self._stamped: dict[int, bytes] = {}
 
+    def lost(self, now_s: float) -> None:
+        """Begin again: what was on its way is queued again, all is asked anew at once."""
+        super().lost(now_s)
+        self._plan, self._pause_until_s, self._clock_retry_s = None, now_s, now_s
+
     # ---- what goes next
 
     def _choose(self, now_s: float) -> None:

@@ -124,10 +124,11 @@ class Nanomodem:
         return max(now_s, due_s)
 
     def lost(self, now_s: float) -> None:
-        """Note that the port is gone: what was on its way is queued again, all is asked anew."""
+        """Begin again: what was on its way is queued again, all is asked anew at once."""
         self.reader.clear()
         self._output.clear()
-        self.outbox.give_back(blame=False)
+        self.outbox.recall(now_s)
+        self._heard_s = self._pause_until_s = now_s
         self._enter(State.CLOSED, now_s)
 
     def send(self, frame: bytes, now_s: float, start_s: float | None = None) -> None:

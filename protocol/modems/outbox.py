@@ -86,6 +86,11 @@ class Outbox:
             else:
                 self._waiting.appendleft(tried)
 
+    def recall(self, now_s: float) -> None:
+        """Put the lent frames back in front; all that wait may start now."""
+        self.give_back(blame=False)
+        self._waiting = deque(replace(i, ready_s=min(i.ready_s, now_s)) for i in self._waiting)
+
     def _together(self, count: int) -> list[Outgoing]:
         """Return leading frames that one packet may take: none has to wait for a later second."""
         latest_s = self._waiting[0].ready_s + 0.5 if self._waiting else 0.0

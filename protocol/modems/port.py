@@ -29,7 +29,8 @@ class SerialPort:
     def __init__(self, path: str, baud: int, tap: Tap | None = None, *, rts: bool = False) -> None:
         self.path, self.baud, self._tap, self._rts = path, baud, tap, rts
         self._unsent = bytearray()
-        self._retry_at_s = 0.0
+        self._tried_s = float("-inf")
+        self._is_given_back = False
         self.reopened = 0
         self.last_error = ""
         self._serial: serial.Serial | None = self._open()
@@ -41,9 +42,11 @@ class SerialPort:
 
     def try_reopen(self, now_s: float) -> bool:
         """Try to open a lost port again when it is time; return whether it came back just now."""
-        if self._serial is not None or now_s < self._retry_at_s:
+        if self._serial is not None or self._is_given_back:
             return False
-        self._retry_at_s = now_s + REOPEN_S
+        if 0.0 <= now_s - self._tried_s < REOPEN_S:  # not where the clock was set back
+            return False
+        self._tried_s = now_s
         try:
             self._serial = self._open()
         except ModemUnavailable:
@@ -78,7 +81,7 @@ class SerialPort:
         """Give the port back for good."""
         if self._serial is not None:
             self._serial.close()
-        self._serial, self._retry_at_s = None, float("inf")
+        self._serial, self._is_given_back = None, True
 
     def _open(self) -> serial.Serial:
         port = serial.Serial(timeout=0, exclusive=True, baudrate=self.baud)
@@ -100,7 +103,7 @@ class SerialPort:
             # pyserial raises TypeError when its descriptor vanished under it
             self.last_error = str(error)
             self._serial.close()
-            self._serial, self._retry_at_s = None, now_s + REOPEN_S
+            self._serial, self._tried_s = None, now_s
             self._unsent.clear()
             return None
 

@@ -68,9 +68,10 @@ class HexLine:
     def next_wakeup_s(self, now_s: float) -> float:
         return now_s
 
-    def lost(self, now_s: float) -> None:  # noqa: ARG002
-        self.outbox.give_back(blame=False)
+    def lost(self, now_s: float) -> None:
+        self.outbox.recall(now_s)
         self._line.clear()
+        self._asked_s = now_s - ALIVE_S
 
     def send(self, frame: bytes, now_s: float, start_s: float | None = None) -> None:
         if not 0 < len(frame) <= self.frame_bytes:

@@ -145,6 +145,40 @@ def test_port_pulled_and_back_loses_nothing_queued(
         assert any("is back" in text for text in both.notices(0))
 
 
+def set_back(driver: DialectDriver, step_s: float) -> None:
+    """From now on poll a driver by a clock that is behind."""
+    poll = driver.poll
+    driver.poll = lambda now_s: poll(now_s - step_s)  # type: ignore[method-assign]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_clock_set_back_keeps_no_frame_waiting(kind: str, tmp_path: Path) -> None:
+    with pair(kind, tmp_path) as both:
+        both.run(60.0)
+        frames = [bytes([n]) * 60 for n in range(4)]
+        for frame in frames[:3]:
+            both.drivers[0].send(frame, both.now_s, both.now_s + 1.0)
+        both.run(1.5)
+        set_back(both.drivers[0], 50.0)
+        both.run(8.0)
+        both.drivers[0].send(frames[3], both.now_s - 50.0)
+        both.run(22.0)
+        assert set(both.frames(1)) == set(frames)
+        assert both.drivers[0].status().queued == 0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_clock_set_back_keeps_no_port_closed(kind: str, tmp_path: Path) -> None:
+    with pair(kind, tmp_path) as both:
+        both.run(60.0)
+        both.emulation.ports[1].unplug()
+        both.run(2.0)
+        set_back(both.drivers[0], 50.0)
+        both.emulation.ports[1].plug()
+        both.run(1.0)
+        assert both.drivers[0].status().reopened == 1
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_port_pulled_and_modem_power_cycled_a_hundred_times(kind: str, tmp_path: Path) -> None:

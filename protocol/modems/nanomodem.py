@@ -115,7 +115,7 @@ class Nanomodem:
         """Return when `poll` will next have something to do, if nothing is heard before."""
         if self.state is State.CLOSED:
             return now_s
-        due_s = self._deadline_s
+        due_s = min(self._deadline_s, self.reader.stale_at_s)
         if self.state is State.IDLE:
             due_s = min(due_s, self._heard_s + ALIVE_QUERY_S)
             if self._requests or self._quality_due:

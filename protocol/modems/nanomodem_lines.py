@@ -4,6 +4,7 @@ Commands have no terminator; replies start with `$` (at once) or `#` (a result) 
 Source: the modem's user guide, v3.2.
 """
 
+import math
 import re
 from collections import deque
 from dataclasses import dataclass
@@ -84,8 +85,7 @@ class ReplyReader:
         self.skipped_bytes = 0
 
     def receive_data(self, data: bytes, now_s: float) -> None:
-        """Take bytes in any chunking."""
-        self.settle(now_s)
+        """Take bytes in any chunking; that they are read late says nothing of when they came."""
         self._last_s = now_s
         for start in range(0, len(data), BUFFER_CAP):
             self._buffer += data[start : start + BUFFER_CAP]
@@ -93,11 +93,16 @@ class ReplyReader:
 
     def settle(self, now_s: float) -> None:
         """Give up an unfinished reply after a silence, and look for another in its bytes."""
-        if now_s - self._last_s <= STALE_S:
+        if now_s < self.stale_at_s:
             return
         while self._buffer:
             self._skip(1)
             self._parse()
+
+    @property
+    def stale_at_s(self) -> float:
+        """When the rest of an unfinished reply is not coming any more."""
+        return self._last_s + STALE_S if self._buffer else math.inf
 
     def next_reply(self) -> Reply | None:
         """Return the oldest reply not yet fetched."""

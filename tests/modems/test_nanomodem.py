@@ -87,6 +87,29 @@ def test_bytes_lost_from_a_payload_do_not_swallow_the_next_reply() -> None:
     assert Reply(kind="#TO") in found
 
 
+def heard_by(modem: Nanomodem) -> list[bytes]:
+    events = iter(modem.next_event, None)
+    return [event.frame for event in events if isinstance(event, FrameHeard)]
+
+
+def test_a_reply_whose_rest_is_read_late_is_whole() -> None:
+    """A loop that stood for longer than a silence finds the rest behind the beginning."""
+    modem, line = Nanomodem(NanomodemSettings()), b"#B00207\x02\x01abcde\r\n"
+    modem.receive_data(line[:9], 10.0)
+    modem.poll(10.0)
+    modem.receive_data(line[9:], 12.0)
+    assert heard_by(modem) == [b"abcde"]
+
+
+def test_a_reply_whose_rest_never_comes_costs_itself_only() -> None:
+    modem = Nanomodem(NanomodemSettings())
+    modem.receive_data(b"#B00207\x02\x01", 10.0)
+    modem.poll(10.0)
+    modem.receive_data(b"#B00203\x02\x01a\r\n", 12.0)
+    modem.poll(12.6)
+    assert heard_by(modem) == [b"a"]
+
+
 @given(st.binary(max_size=300), st.integers(1, 30))
 def test_any_bytes_in_any_chunking_never_raise(data: bytes, step: int) -> None:
     assert read(data, step) == read(data)

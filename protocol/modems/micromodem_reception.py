@@ -12,6 +12,8 @@ from protocol.modems.events import FrameHeard, LinkQuality
 from protocol.modems.nmea import Sentence
 
 DAY_S = 86_400.0
+TIMED_OUT = 2
+"""The mode of statistics that belong to no frame."""
 PSK_FRAMES_CAP = 8
 """Most frames of one packet (rate 5); what exceeds it before the statistics is dropped."""
 
@@ -162,6 +164,11 @@ class PacketInProgress:
     def overdue(self, now_s: float) -> bool:
         """Return whether frames have waited longer for statistics than a packet lasts."""
         return bool(self._frames) and now_s - self._since_s > STATISTICS_WAIT_S
+
+    def is_of(self, statistics: Statistics) -> bool:
+        """Return whether statistics are, as far as they tell, those of the frames that wait."""
+        same = all(statistics.source in {None, sender} for sender, _ in self._frames)
+        return self.waiting and same and statistics.mode != TIMED_OUT
 
     @property
     def waiting(self) -> bool:

@@ -289,7 +289,7 @@ class Traffic(Setup):
         if statistics.clock_mode is not None:
             self.clock.mode = statistics.clock_mode
         told = statistics.second_of_day if statistics.rate != 0 else None
-        toa_s = self.clock.arrival_s(told, now_s) if self.packet.waiting else None
+        toa_s = self.clock.arrival_s(told, now_s) if self.packet.is_of(statistics) else None
         heard = self.packet.finish(toa_s, now_s)
         if heard or statistics.bad_frames:
             self._events.append(quality_of(statistics, len(heard)))

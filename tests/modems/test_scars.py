@@ -298,3 +298,31 @@ def test_events_that_nobody_fetches_are_bounded(core_type: type[MicroModem | Nan
         core.receive_data(nmea.encode("CAMUA", 2, 1, "0001"), n * 0.1)
         core.receive_data(b"#B00204\x02%cxx\r\n" % (n % 256), n * 0.1)
     assert len(core._events) <= 512
+
+
+def statistics(mode: int, arrival_s: float, source: str | int) -> bytes:
+    """Return the line about a packet that arrived so many seconds into the day."""
+    head: list[str | int] = [mode, f"0000{arrival_s:07.4f}", 3 << 2, *[0] * 9]
+    return nmea.encode("CACST", *head, 4, source, 1, 0, 3, 1, 0, *[0] * 10)
+
+
+@pytest.mark.parametrize(("mode", "source"), [(0, 3), (2, 2), (2, "")])
+def test_a_frame_whose_statistics_are_lost_takes_no_arrival_of_another_packet(
+    mode: int, source: str | int
+) -> None:
+    rig = micro_rig()
+    core = rig.cores[1]
+    core.receive_data(nmea.encode("CARXD", 2, 1, 0, 1, "AABB"), rig.now_s + 3.0)
+    core.receive_data(statistics(mode, rig.now_s + 5.0, source), rig.now_s + 6.0)
+    (heard,) = [event for event in iter(core.next_event, None) if isinstance(event, FrameHeard)]
+    assert (heard.source, heard.toa_s) == (2, None)
+
+
+@pytest.mark.parametrize("source", [2, ""])
+def test_a_frame_takes_the_arrival_that_its_own_statistics_tell(source: str | int) -> None:
+    rig = micro_rig()
+    core = rig.cores[1]
+    core.receive_data(nmea.encode("CARXD", 2, 1, 0, 1, "AABB"), rig.now_s + 3.0)
+    core.receive_data(statistics(0, rig.now_s + 0.4, source), rig.now_s + 3.1)
+    (heard,) = [event for event in iter(core.next_event, None) if isinstance(event, FrameHeard)]
+    assert heard.toa_s == pytest.approx(rig.now_s + 0.4, abs=1e-3)

@@ -75,7 +75,8 @@ class Nanomodem:
         self._requests: deque[tuple[str, int]] = deque(maxlen=REQUESTS_CAP)
         self._peer = 0
         self._awaits_answer = self._is_frame = self._quality_due = False
-        self._payload, self._sequence = b"", 0
+        self._payload = b""
+        self._sequence: int | None = None
         self._last_sequence: dict[int, int] = {}
         self._output = bytearray()
         self._deadline_s, self._heard_s, self._started_s = math.inf, 0.0, 0.0
@@ -286,7 +287,9 @@ class Nanomodem:
         if not stamped:
             return "nothing"
         settings, self._is_frame, self._started_s = self.settings, True, now_s
-        if item.attempts == 0:
+        if self._sequence is None:  # a peer may have heard an earlier life's
+            self._sequence = int(now_s) % 256
+        elif item.attempts == 0:
             self._sequence = (self._sequence + 1) % 256
         self._payload = bytes([settings.address, self._sequence]) + stamped[0]
         self._peer = settings.destination

@@ -219,6 +219,18 @@ def test_acknowledged_frames_return_what_was_sent_and_the_range() -> None:
     assert measured.owtt_s == pytest.approx(0.6, abs=1e-4)
 
 
+def test_the_first_acknowledged_frame_after_a_restart_counts() -> None:
+    rig = nano_rig(
+        settings=lambda n: NanomodemSettings(address=n, destination=3 - n, acknowledge=True)
+    )
+    for life in range(3):
+        rig.cores[1] = Nanomodem(core_of(rig, 1).settings)
+        rig.run_until(rig.now_s + 10.0)
+        rig.cores[1].send(b"life %d" % life, rig.now_s)
+        rig.run_until(rig.now_s + 10.0)
+        assert frames_of(rig, 2) == [b"life %d" % life]
+
+
 def test_acknowledged_frames_are_repeated_until_they_arrive_and_count_once() -> None:
     rig = nano_rig(settings=to_the_other, water=replace(CALM, loss=0.3), seed=4)
     frames = [bytes([n]) * 20 for n in range(30)]

@@ -97,18 +97,16 @@ class Setup(Machine):
         return self._set_next(sentence, now_s)
 
     def plan_clock(self, sentence: Sentence, now_s: float) -> None:  # noqa: ARG002
-        """Set the clock early in a second, to the next one."""
-        self.clock.is_set = False
-        self._say_in_window(self.clock.set_line, now_s, now_s)
+        """Set the clock early in a second, to the next one, by the newer line at first."""
+        self._set_clock(now_s, speaks_new=True)
 
-    def plan_other_clock(self, sentence: Sentence, now_s: float) -> str | None:
+    def plan_other_clock(self, sentence: Sentence, now_s: float) -> str | None:  # noqa: ARG002
         """Try the other generation's line for setting the clock, once."""
         if not self.clock.speaks_new:
             self._complain("modem takes no clock; ranges cannot be measured one way", now_s)
             self._clock_retry_s = now_s + CLOCK_RETRY_S
             return "done"
-        self.clock.speaks_new = False
-        self.plan_clock(sentence, now_s)
+        self._set_clock(now_s, speaks_new=False)
         return None
 
     def ask_clock(self, sentence: Sentence, now_s: float) -> str | None:  # noqa: ARG002
@@ -158,6 +156,10 @@ class Setup(Machine):
             self.clock.firmware = parse_version(fields[2]) or self.clock.firmware
             self.clock.note_heartbeat(fields[0], now_s)
             self._fire("booted", Sentence(name="CAREV", fields=fields), now_s)
+
+    def _set_clock(self, now_s: float, *, speaks_new: bool) -> None:
+        self.clock.is_set, self.clock.speaks_new = False, speaks_new
+        self._say_in_window(self.clock.set_line, now_s, now_s)
 
     def _clock_query(self, now_s: float) -> bytes:
         self._asked_s = now_s

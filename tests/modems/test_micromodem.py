@@ -109,6 +109,25 @@ def test_small_frames_go_as_flexible_packets_where_the_firmware_has_them() -> No
     assert unit_of(rig, 1)._uid == 1
 
 
+def test_a_line_damaged_while_the_clock_is_set_does_not_end_its_checking() -> None:
+    """The older line is tried then; the newer one, whose clock can be asked, after a restart."""
+    rig = micro_rig()
+    unit, core = rig.bench.units[1], core_of(rig, 1)
+    receive = unit.receive_data
+
+    def damage(data: bytes, now_s: float) -> None:
+        receive(data.replace(b"$CCTMS,2", b"$CCTMS,3"), now_s)
+
+    unit.receive_data = damage  # type: ignore[method-assign]
+    unit.power_cycle(rig.now_s)
+    rig.run_until(rig.now_s + 20.0)
+    assert (core.clock.is_set, core.clock.speaks_new) == (True, False)
+    unit.receive_data = receive  # type: ignore[method-assign]
+    unit.power_cycle(rig.now_s)
+    rig.run_until(rig.now_s + 20.0)
+    assert (core.clock.is_set, core.clock.speaks_new) == (True, True)
+
+
 def test_old_firmware_gets_a_data_cycle_instead() -> None:
     rig = micro_rig(quirks=MM1_QUIRKS)
     rig.cores[1].send(answer(), rig.now_s)

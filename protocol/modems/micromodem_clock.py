@@ -9,6 +9,7 @@ from datetime import UTC, datetime, timedelta
 
 from protocol.errors import ConfigError
 from protocol.modems.micromodem_reception import (
+    integer,
     mission_time_s,
     pulse_is_good,
     second_of_day,
@@ -48,8 +49,9 @@ def parse_utc(text: str) -> datetime:
 
 def parse_version(text: str) -> tuple[int, ...] | None:
     """Return a firmware version like 2.0.27087 as numbers."""
-    parts = text.split(".")
-    return tuple(map(int, parts)) if all(part.isdecimal() for part in parts) else None
+    parts = [integer(part) for part in text.split(".")]
+    numbers = tuple(part for part in parts if part is not None)
+    return numbers if len(numbers) == len(parts) else None
 
 
 class ModemClock:

@@ -71,6 +71,7 @@ MEANINGLESS = [
     nmea.encode("CADRQ", 0, 2, 0, 0, 256, 999999),
     nmea.encode("CAREV", "", "INIT"),
     nmea.encode("CAREV", "", "AUV", "a.b.c"),
+    nmea.encode("CAREV", "", "AUV", "9" * 5000),
     nmea.encode("CAMPR", 1, 2, "-1"),
     nmea.encode("CAACK", 2, 1, -5, 1),
     nmea.encode("CATMQ", "yesterday"),

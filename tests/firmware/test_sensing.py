@@ -47,7 +47,7 @@ def test_level_ping_heading_north_spreads_east_and_west_at_seabed_depth() -> Non
 
 def test_roll_to_starboard_turns_the_port_beams_up_and_lever_arm_follows_heading() -> None:
     rolled, _ = soundings_from_ping(ping(roll_rad=0.1), 0.0, 0.0, SonarSettings())
-    assert rolled[0, 2] > 50.0 or rolled[2, 2] > 50.0
+    assert rolled[2, 2] > 50.0 > rolled[0, 2]
     assert rolled[1, 1] == pytest.approx(-40.0 * np.sin(0.1))
     levered = SonarSettings(lever_forward_m=2.0)
     east, _ = soundings_from_ping(ping(yaw_rad=np.pi / 2), 0.0, 0.0, levered)

@@ -12,6 +12,7 @@ from hil.mission import BenchMission
 from protocol.codec import decode, encode
 from protocol.modems.dialect_driver import DialectDriver
 from protocol.modems.events import LinkQuality, RangeMeasured
+from protocol.modems.micromodem import MicroModem
 from protocol.packets import Answer, Header, Profile, SubmapFragment
 from protocol.timestamps import one_way_travel_time_s, to_tx_second
 
@@ -79,8 +80,15 @@ def test_t01_identify(open_ends: OpenEnds) -> None:
 
 def test_t02_configure(open_ends: OpenEnds) -> None:
     ends = ready(open_ends())
-    for modem in ends.bench.modems:
-        assert modem.status().errors.get("settings_refused", 0) == 0
+    cores = [modem.core for modem in ends.bench.modems if isinstance(modem, DialectDriver)]
+    for core in cores:
+        assert core.status().get("settings_refused", 0) == 0
+        core.lost(ends.bench.now_s)  # begins again by asking the modem what is set
+    ready(ends)
+    for core in cores:
+        if isinstance(core, MicroModem):
+            told = {key: int(core.told[key]) for key in ("SRC", "CST", "SNV")}
+            assert told == {"SRC": core.settings.address, "CST": 1, "SNV": 1}
 
 
 def test_t03_send(open_ends: OpenEnds) -> None:

@@ -39,7 +39,7 @@ class Setup(Machine):
 
     def __init__(self, settings: MicroModemSettings, stamp: Stamp = stamp_frame) -> None:
         super().__init__(settings, stamp)
-        self._known: dict[str, str] = {}
+        self.told: dict[str, str] = {}  # by the last dump
         self._unset: deque[tuple[str, str]] = deque()
         self._asked_s = 0.0
         self._clock_tries, self._clock_retry_s = 0, 0.0
@@ -56,7 +56,7 @@ class Setup(Machine):
 
     def ask_dump(self, sentence: Sentence, now_s: float) -> None:  # noqa: ARG002
         """Ask for all settings."""
-        self._known.clear()
+        self.told.clear()
         self._say(encode("CCCFQ", "ALL"), now_s)
 
     def ask_other_dump(self, sentence: Sentence, now_s: float) -> None:  # noqa: ARG002
@@ -66,8 +66,8 @@ class Setup(Machine):
 
     def note_setting(self, sentence: Sentence, now_s: float) -> None:
         """Remember one line of the dump; each line renews the wait for silence."""
-        if len(sentence.fields) >= 2 and len(self._known) < REMEMBERED_SETTINGS:
-            self._known[sentence.fields[0].upper()] = sentence.fields[1]
+        if len(sentence.fields) >= 2 and len(self.told) < REMEMBERED_SETTINGS:
+            self.told[sentence.fields[0].upper()] = sentence.fields[1]
         self._deadline_s = now_s + WAITS[State.DUMPING].seconds
 
     def ask_next_setting(self, sentence: Sentence, now_s: float) -> str | None:
@@ -75,7 +75,7 @@ class Setup(Machine):
         self._unset = deque(
             (key, value)
             for key, value in wanted_settings(self.settings).items()
-            if not self._same((self._known.get(key, ""),), value)
+            if not self._same((self.told.get(key, ""),), value)
         )
         return self._set_next(sentence, now_s)
 

@@ -133,7 +133,7 @@ def test_a_configuration_dump_that_never_ends_is_bounded() -> None:
         core.receive_data(nmea.encode("CACFG", f"K{n}", n), n * 0.01)
         core.poll(n * 0.01)
     states = [core.state]
-    assert len(core._known) <= 512
+    assert len(core.told) <= 512
     core.poll(40.0)
     assert [*states, core.state] == [State.DUMPING, State.CONFIGURING]
 

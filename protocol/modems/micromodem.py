@@ -77,7 +77,7 @@ class MicroModem(Traffic):
     @property
     def lead_s(self) -> float:
         """How long before its second of transmission a full packet must be handed over."""
-        return self._lead_of([self.frame_bytes] * self.frames_per_packet)
+        return self._lead_of([self.frame_bytes] * self.frames_per_packet, flexible=False)
 
     @property
     def ready(self) -> bool:

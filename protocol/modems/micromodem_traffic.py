@@ -96,7 +96,7 @@ class Traffic(Setup):
         if first is None:
             self._plan = None
             return math.inf
-        lead_s = self._lead_of(sizes)
+        lead_s = self._lead_of(sizes, flexible=self._goes_flexible())
         latest_s = LATE_S + self.settings.poll_period_s
         if self._plan is None or self._plan[2] != len(sizes) or now_s > self._plan[1] + latest_s:
             start_s = max(math.ceil(now_s + lead_s - LATE_S / 2), math.ceil(first.ready_s))
@@ -106,10 +106,10 @@ class Traffic(Setup):
     def _most_frames(self) -> int:
         return 1 if self._goes_flexible() else self.frames_per_packet
 
-    def _lead_of(self, sizes: list[int]) -> float:
+    def _lead_of(self, sizes: list[int], *, flexible: bool) -> float:
         """Return how early to begin: line time, and a poll's delay at the start and per request."""
         characters = CYCLE_LINE_BYTES + sum(FRAME_LINE_BYTES + 2 * size for size in sizes)
-        delays = 1 if self._goes_flexible() else 1 + len(sizes)
+        delays = 1 if flexible else 1 + len(sizes)
         margin_s = TURNAROUND_S + self._extra_lead_s + delays * self.settings.poll_period_s
         return margin_s + characters * 10.0 / self.settings.baud
 

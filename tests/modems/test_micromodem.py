@@ -100,6 +100,13 @@ def test_frames_larger_than_the_rate_carries_are_refused_with_advice() -> None:
         core.send(bytes(256), 0.0)
 
 
+def test_the_lead_of_a_full_packet_is_the_same_whatever_waits() -> None:
+    rig = micro_rig()
+    lead_s = rig.cores[1].lead_s
+    rig.cores[1].send(answer(), rig.now_s)
+    assert rig.cores[1].lead_s == lead_s
+
+
 def test_small_frames_go_as_flexible_packets_where_the_firmware_has_them() -> None:
     rig = micro_rig()
     rig.cores[1].send(answer(), rig.now_s)

@@ -79,7 +79,7 @@ class FragmentQueue:
             self._forget(next(iter(self._kept)))
 
     def request(self, submap: int, bitmap: int, asked_s: float) -> None:
-        """Take the leader's wish; asked_s is when its answer was transmitted.
+        """Take the leader's wish; asked_s is when its answer was heard.
 
         It asks for the oldest sub-map that it still holds open: what was wanted of older ones, or
         of this one and is not any more, would arrive in vain and make the next repeat late too.

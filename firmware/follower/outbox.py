@@ -25,14 +25,13 @@ class Outbox:
         self._queue = FragmentQueue(settings)
         self._trajectory_packets = 0
 
-    def add(self, packets: Sequence[SubmapPacket] | Sequence[SubmapFragment]) -> bool:
+    def add(self, packets: Sequence[SubmapPacket] | Sequence[SubmapFragment]) -> None:
         """Queue a sub-map, unless half of an earlier one still waits: it would only grow old."""
         if 2 * self._queue.fresh >= max(len(packets), 2):
             self.counters["submaps_without_air"] += 1
-            return False
+            return
         self._queue.add(packets)
         self.counters["submaps_sent"] += 1
-        return True
 
     def request(self, submap: int, bitmap: int, asked_s: float) -> None:
         """Take the leader's request for fragments that it lacks."""

@@ -50,17 +50,12 @@ class Statistics:
     clock_mode: int | None
     rate: int | None = None
     source: int | None = None
-    psk_error: int | None = None
-    packet_type: int | None = None
     frames: int | None = None
     bad_frames: int | None = None
     snr_in_db: float | None = None
     snr_out_db: float | None = None
     quality: int | None = None
     doppler_mps: float | None = None
-    noise_db: int | None = None
-    carrier_hz: int | None = None
-    bandwidth_hz: int | None = None
 
 
 def second_of_day(text: str) -> float | None:
@@ -79,9 +74,8 @@ def second_of_day(text: str) -> float | None:
 def parse_statistics(sentence: Sentence) -> Statistics | None:
     """Return what a CACST line tells, or None when not even its mode can be read.
 
-    Version 6 lines carry a leading `6` and shift everything by one. Some firmware prints the
-    noise and the carrier without a comma between them (28 fields): the carrier is then the last
-    five digits.
+    Version 6 lines carry a leading `6` and shift everything by one. Noise, carrier and bandwidth,
+    which come last and in some firmware run together, are left alone.
     """
     fields = list(sentence.fields)
     if fields and fields[0] == "6":
@@ -89,26 +83,19 @@ def parse_statistics(sentence: Sentence) -> Statistics | None:
     mode = integer(fields[0]) if fields else None
     if mode is None:
         return None
-    if len(fields) == 28 and len(fields[26]) > 5 and fields[26].isdigit():
-        fields[26:27] = [fields[26][:-5], fields[26][-5:]]
-    fields += [""] * (29 - len(fields))
+    fields += [""] * (26 - len(fields))
     return Statistics(
         mode=mode,
         second_of_day=second_of_day(fields[1]),
         clock_mode=integer(fields[2]),
         rate=integer(fields[12]),
         source=integer(fields[13]),
-        psk_error=integer(fields[15]),
-        packet_type=integer(fields[16]),
         frames=integer(fields[17]),
         bad_frames=integer(fields[18]),
         snr_in_db=decimal(fields[20]),
         snr_out_db=decimal(fields[21]),
         quality=integer(fields[24]),
         doppler_mps=decimal(fields[25]),
-        noise_db=integer(fields[26]),
-        carrier_hz=integer(fields[27]),
-        bandwidth_hz=integer(fields[28]),
     )
 
 

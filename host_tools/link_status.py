@@ -13,7 +13,7 @@ from protocol.seal_state import DISK
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "modem": ("modem_",),
-    "seal": ("modem_opened", "modem_not_sealed"),
+    "seal": ("modem_opened", "modem_not_sealed", "modem_marks_unwritten"),
     "rejected": ("modem_rejected_", "rejected_"),
     "frames": ("frames_", "slots_"),
     "fragments": ("fragments_", "submaps_"),

@@ -81,6 +81,8 @@ class FrameCounter(Protocol):
 class Marks(Protocol):
     """Keeps the highest counter accepted from each sender across restarts of the receiver."""
 
+    failed_writes: int
+
     def load(self) -> dict[int, int]:
         """Return the marks by sender."""
 
@@ -133,6 +135,11 @@ class Opener:
         self._suite = suite or Blake2sSuite()
         loaded = marks.load() if marks is not None else {}
         self._windows = {sender: ReplayWindow(mark) for sender, mark in loaded.items()}
+
+    @property
+    def marks_unwritten(self) -> int:
+        """How often the marks could not be kept, so that a restart would take frames again."""
+        return 0 if self._marks is None else self._marks.failed_writes
 
     def open(self, packet: Packet) -> Packet:
         """Return the packet inside a sealed frame, in its plain profile.

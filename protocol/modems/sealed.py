@@ -60,6 +60,10 @@ class SealedLink:
         self.counters["opened"] += 1
         return encode(_whole(opened))
 
+    def status(self) -> dict[str, int]:
+        """Return the counters, and how often the marks of what was opened could not be kept."""
+        return {**self.counters, "marks_unwritten": self._opener.marks_unwritten}
+
 
 class SealedModem:
     """A modem behind a seal; a driver with a lead stamps, and therefore seals, by itself."""
@@ -108,7 +112,7 @@ class SealedModem:
     def status(self) -> ModemStatus:
         """Return the counters, the seal's among the dialect's."""
         status = self._modem.status()
-        return replace(status, errors={**status.errors, **self.link.counters})
+        return replace(status, errors={**status.errors, **self.link.status()})
 
     def close(self) -> None:
         """Give the port back."""

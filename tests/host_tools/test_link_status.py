@@ -67,11 +67,13 @@ def test_what_a_vehicle_counts_has_its_place(tmp_path: Path) -> None:
     modem = LoopbackMedium(water).modem(1)
     port = ModemPort(SealedModem(modem, link))
     link.open(b"noise")
+    marks.failed_writes = 2
     counter.next()
     core = FollowerCore(1, 0, START, settings=FollowerSettings(), slots=Slots(SlotSettings()))
     core.receive_frame(bytes(30), None, 0.0)
     lines = list(status_lines(folder_of(tmp_path, {**core.status(), **port.status()})))
     assert "  rejected    crc 1, size 1" in lines
+    assert "  seal        marks unwritten 2" in lines
     assert "  fragments   waiting 0, wanted 0" in lines
     assert lines[-1] == "seal_1: counters reserved up to 64, highest accepted by sender {}"
 

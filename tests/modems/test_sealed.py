@@ -87,7 +87,7 @@ def test_a_fragment_crosses_with_fourteen_points_and_a_gap() -> None:
     np.testing.assert_array_equal(arrived.points_ned_m[:14], packet.points_ned_m[:14])
     assert np.isnan(arrived.points_ned_m[14]).all()
     assert arrived.header == packet.header
-    assert leader.status().errors == {"opened": 1}
+    assert leader.status().errors == {"opened": 1, "marks_unwritten": 0}
 
 
 def test_a_trajectory_crosses_without_its_oldest_state() -> None:
@@ -129,7 +129,8 @@ def test_plain_frames_are_not_let_through_and_counted() -> None:
     water.modem(1).send(encode(trajectory()), 0.0)
     water.modem(1).send(b"noise", 4.0)
     assert heard(leader, 10.0) == []
-    assert leader.status().errors == {"rejected_plain": 1, "rejected_size": 1}
+    rejected = {"rejected_plain": 1, "rejected_size": 1}
+    assert leader.status().errors == {**rejected, "marks_unwritten": 0}
 
 
 def test_a_frame_that_cannot_be_sealed_stays_here() -> None:
@@ -140,7 +141,7 @@ def test_a_frame_that_cannot_be_sealed_stays_here() -> None:
     header = replace(trajectory().header, profile=Profile.SUBMAP_DENSE)
     follower.send(encode(SubmapFragment(header=header, body=b"\xff" * 244)), 8.0)
     assert follower.status().sent == 1
-    assert follower.status().errors == {"not_sealed": 2}
+    assert follower.status().errors == {"not_sealed": 2, "marks_unwritten": 0}
 
 
 def test_a_driver_that_stamps_seals_with_the_second_of_its_start() -> None:

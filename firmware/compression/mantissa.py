@@ -100,7 +100,7 @@ def without_parity(points_ned_m: NDArray[np.float32] | Array, steps: Steps) -> A
 def completed(fragments: Mapping[int, Float32], mean_depth_m: np.float32) -> tuple[Array, int]:
     """Return all points (M, 3) to be had from fragments (15, 3), and how many were recovered.
 
-    Without parity, or when too little of it arrived, or about a mean depth that none is, these are
+    Without parity, when too little of it arrived, or where the mean depth means nothing, these are
     the points that arrived.
     """
     arrived = [np.asarray(fragments[i], dtype=np.float64) for i in sorted(fragments)]

@@ -41,11 +41,11 @@ def simulate(
     check_air(settings)
     scenario = settings.scenario
     site = place_survey(open_terrain(terrain, scenario.relief_seed), scenario, seed)
-    if out is not None:
-        forget_mission(out, terrain)
     truth_map = DepthMap(site.window)
     vehicles = simulated_vehicles(settings, site, seed, truth_map.add)
     leader, followers = local_nodes(settings, vehicles, baseline, store)
+    if out is not None:
+        forget_mission(out, terrain)
     deliveries: list[Delivery] = []
     unheard = Unheard(leader) if baseline == "unlimited" else None
 

@@ -49,7 +49,6 @@ def host_mission(
     check_frames(modems, voyage.settings)
     vehicles = simulated_vehicles(voyage.settings, voyage.site, voyage.seed)
     water = water_between(voyage.settings, vehicles, voyage.seed)
-    forget_mission(out, voyage.site.raster.path)
     deliveries: list[Delivery] = []
     emulated = None if modems == "raw" else EmulatedModems(modems, water, deliveries.append)
     paced = progress if pace is None else pace.after(progress)
@@ -62,6 +61,7 @@ def host_mission(
         pace=pace,
         modems=emulated,
     ) as group:
+        forget_mission(out, voyage.site.raster.path)
         ready(group)
         group.wait_for_all()
         if pace is not None:

@@ -41,6 +41,10 @@ def test_a_folder_that_is_used_again_tells_of_the_new_mission_only(
     for old in ("report.html", "follower_2_final.tum"):
         (tmp_path / old).write_text("old")
     assert simulate(tmp_path, "--no-report", "--set", "leg_m=9000", "--set", "duration_min=90") == 2
+    store = tmp_path / "store"
+    store.mkdir()
+    (store / "leader.sqlite").touch()
+    assert simulate(tmp_path, "--no-report", "--store", str(store)) == 2
     assert (tmp_path / "report.html").exists()  # a mission that cannot begin removes nothing
     assert simulate(tmp_path, "--no-report") == 0
     assert not (tmp_path / "report.html").exists()

@@ -262,6 +262,8 @@ class Traffic(Setup):
             self.packet.take(sentence, now_s)
         elif sentence.name == "CACST":
             self._take_statistics(sentence, now_s)
+        elif sentence.name == "CARXP":  # a packet begins: the one before has no statistics
+            self._events.extend(self.packet.finish(None, now_s))
         elif sentence.name == "CATOA" and len(fields) >= 2 and self.packet.waiting:
             self.clock.mode = integer(fields[1], self.clock.mode)
             toa_s = self.clock.arrival_s(second_of_day(fields[0]), now_s)

@@ -327,3 +327,17 @@ def test_a_frame_takes_the_arrival_that_its_own_statistics_tell(source: str | in
     core.receive_data(statistics(0, rig.now_s + 0.4, source), rig.now_s + 3.1)
     (heard,) = [event for event in iter(core.next_event, None) if isinstance(event, FrameHeard)]
     assert heard.toa_s == pytest.approx(rig.now_s + 0.4, abs=1e-3)
+
+
+def test_a_packet_that_begins_ends_one_whose_statistics_are_lost() -> None:
+    """Of the same sender, four seconds later, it would pass its arrival on to both."""
+    rig = micro_rig()
+    core = rig.cores[1]
+    core.receive_data(nmea.encode("CARXD", 2, 1, 0, 1, "AABB"), rig.now_s + 3.0)
+    core.receive_data(nmea.encode("CARXP", 0), rig.now_s + 6.0)
+    core.receive_data(nmea.encode("CARXD", 2, 1, 0, 1, "CCDD"), rig.now_s + 7.0)
+    core.receive_data(statistics(0, rig.now_s + 4.4, 2), rig.now_s + 7.1)
+    heard = [event for event in iter(core.next_event, None) if isinstance(event, FrameHeard)]
+    assert [event.frame for event in heard] == [b"\xaa\xbb", b"\xcc\xdd"]
+    assert heard[0].toa_s is None
+    assert heard[1].toa_s == pytest.approx(rig.now_s + 4.4, abs=1e-3)

@@ -15,7 +15,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "modem": ("modem_",),
     "seal": ("modem_opened", "modem_not_sealed", "modem_marks_unwritten"),
     "rejected": ("modem_rejected_", "rejected_"),
-    "frames": ("frames_", "slots_"),
+    "frames": ("frames_", "slots_", "boots_refused"),
     "fragments": ("fragments_", "submaps_"),
     "reassembly": ("reassembly_",),
     "answers": ("answers_", "repeats_"),
@@ -59,6 +59,8 @@ def advice_lines(counters: Mapping[str, float]) -> Iterator[str]:
         yield "frames bear our own modem's address: give every modem its own ?address="
     if counters.get("frames_with_our_number") or counters.get("modem_rejected_reflected"):
         yield "frames bear our own vehicle's number: give every vehicle its own --vehicle"
+    if counters.get("boots_refused"):
+        yield "a vehicle restarts without end, or two bear one number: give each its own --vehicle"
     if counters.get("rejected_version") or counters.get("modem_rejected_version"):
         yield "frames of another version were heard: bring all vehicles to one release"
     if counters.get("modem_rejected_plain"):

@@ -78,6 +78,12 @@ def test_what_a_vehicle_counts_has_its_place(tmp_path: Path) -> None:
     assert lines[-1] == "seal_1: counters reserved up to 64, highest accepted by sender {}"
 
 
+def test_boots_without_end_are_told(tmp_path: Path) -> None:
+    lines = list(status_lines(folder_of(tmp_path, {"boots_refused": 3})))
+    assert "  frames      boots refused 3" in lines
+    assert any("two bear one number" in line for line in lines)
+
+
 def test_a_finished_simulation_is_read_from_its_summary(tmp_path: Path) -> None:
     summary = {"counters": {"follower_1": {"answers_used": 2}, "line_leader": {"joined": 1}}}
     (tmp_path / "summary.json").write_text(json.dumps(summary))

@@ -143,7 +143,7 @@ class LeaderCore:
         if not 1 <= header.vehicle <= self._slots.settings.followers:
             self.counters["frames_of_unknown_vehicles"] += 1
             return
-        if not self.fleet.admits(header, now_s):
+        if not self.fleet.admit(header, now_s):
             return
         self.counters["frames_received"] += 1
         if toa_s is not None and not is_arrival(toa_s, now_s):

@@ -78,12 +78,15 @@ class Fleet:
         """Return the vehicles that have a chain, the leader first."""
         return sorted({vehicle_of(chain) for chain in self._graph.chains()})
 
-    def admits(self, header: Header, now_s: float) -> bool:
-        """Return whether a frame may be used: not where it begins too many boots for an hour."""
+    def admit(self, header: Header, now_s: float) -> bool:
+        """Begin the boot that a frame tells of, if it is new; return whether the frame may be used.
+
+        It may not where its vehicle has begun too many boots within the hour.
+        """
         known = self._followers.get(header.vehicle)
         if known is None or self._told(header, known) <= known.boot:
             return True
-        is_admitted = self._may_boot(known, now_s)
+        is_admitted = self._note_boot(known, now_s)
         if is_admitted:
             self.boot_of(header)
         return is_admitted
@@ -114,12 +117,11 @@ class Fleet:
         s, last = self._settings, None
         for k in np.flatnonzero(usable_states(states)):
             time_s = first_s + float(k)
-            north_m, east_m, yaw_rad = (float(value) for value in states[k])
             if time_s > now_s:
                 self.counters["states_from_the_future"] += 1
             elif time_s < now_s - s.oldest_state_s:
                 self.counters["states_too_old"] += 1
-            elif (chain := self._place(header, time_s, north_m, east_m, yaw_rad)) is not None:
+            elif (chain := self._place(header, time_s, states[k], now_s)) is not None:
                 last = chain, time_s
             else:
                 self.counters["states_that_jump"] += 1
@@ -189,12 +191,13 @@ class Fleet:
         return sorted(chains, key=lambda chain: float(self.track(chain).time_s[0]))
 
     def _place(
-        self, header: Header, time_s: float, north_m: float, east_m: float, yaw_rad: float
+        self, header: Header, time_s: float, state: NDArray[np.floating], now_s: float
     ) -> int | None:
         """Keep a state that its track's neighbours allow, and return its chain, or None.
 
         A lasting jump begins a new boot.
         """
+        north_m, east_m, yaw_rad = (float(value) for value in state)
         chain = self.chain(header)
         buffer = self._tracks.setdefault(chain, TrackBuffer())
         if buffer.is_plausible(time_s, north_m, east_m, self._settings.fastest_mps):
@@ -212,7 +215,7 @@ class Fleet:
         jumped.append((time_s, north_m, east_m))
         if len(jumped) >= self._settings.jumped_states:
             jumped.clear()
-            if self._may_boot(known, time_s):
+            if self._note_boot(known, now_s):
                 known.boot += BOOT_EPOCHS
                 self.counters["lasting_jumps"] += 1
         return None
@@ -226,8 +229,8 @@ class Fleet:
             return earlier
         return known.boot + ahead
 
-    def _may_boot(self, known: _Vehicle, now_s: float) -> bool:
-        """Return whether a vehicle may begin another boot now, and note it."""
+    def _note_boot(self, known: _Vehicle, now_s: float) -> bool:
+        """Note that a vehicle begins another boot; return False where it may not."""
         begun_s = known.begun_s
         if len(begun_s) == _MOST_BOOTS and abs(now_s - begun_s[0]) < _HOUR_S:
             self.counters["boots_refused"] += 1

@@ -99,7 +99,13 @@ class Solver:
     def restart(self, estimate: Mapping[int, Array]) -> None:
         """Build ISAM2 anew from a ledger that was changed at will, and an estimate of its keys."""
         self._factors.clear()
-        self._rebuild(_values_of(estimate))
+        values = _values_of(estimate)
+        try:
+            self._rebuild(values)
+        except RuntimeError:
+            self._factorization = "QR"
+            self._rebuild(values)
+            self.rebuilds += 1
         self._fresh = gtsam.Values()
         self._changed.clear()
 

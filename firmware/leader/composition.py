@@ -3,8 +3,8 @@
 Beyond the window of detail a chain keeps one node a piece. What lies between is frozen in the shape
 that it was last estimated in, and moves with the nodes around it; dead reckoning, fixes, ranges and
 closures of a piece are composed. A piece keeps its closures with the oldest pieces, which the start
-holds best: so the past hangs on a fixed map rather than on all of itself. Hints it keeps where it
-has no closures.
+holds best: so the past hangs on a fixed map rather than on all of itself. Hints it keeps where its
+closures leave room.
 """
 
 from collections import defaultdict

@@ -262,7 +262,7 @@ class _Odometry:
         return offset_m, variance_m2[:, None, None] * np.eye(2)
 
     def alike(self) -> NDArray[np.bool_]:
-        """Return which closures (K, K) share soundings at both ends, whichever way round."""
+        """Return which closures (K, K) may share soundings at both ends, whichever way round."""
         near = np.abs(self._time_s[:, None] - self._time_s) < _SUBMAP_S
         near &= self._chain[:, None] == self._chain
         straight = near[::2, ::2] & near[1::2, 1::2]

@@ -102,10 +102,11 @@ class PoseGraph(Estimate):
         wandered_mps = self._walk * np.sqrt(abs(passed_s) + s.node_interval_s)
         state = self._state(origin).copy()
         state[:2] += moved_m - state[2:] * interval_s
+        target = self._append(chain, time_s, reckoned_m, state)
         self._enter(
             TieRecord(
                 origin=origin,
-                target=self._append(chain, time_s, reckoned_m, state),
+                target=target,
                 parameters=chain.parameters,
                 moved_m=moved_m,
                 interval_s=interval_s,
@@ -134,7 +135,7 @@ class PoseGraph(Estimate):
             if track.gap_s(time_s) <= interval_s / 2:
                 self._step(chain, time_s, track.position_at(time_s))
                 if time_s % s.alike_interval_s == 0.0:
-                    self._tie(chain, time_s - s.alike_interval_s, time_s)
+                    self._walk_alike(chain, time_s - s.alike_interval_s, time_s)
                 added += 1
         return added
 
@@ -298,7 +299,7 @@ class PoseGraph(Estimate):
         noise = self._settings.odometry_noise
         self._enter(chain.odometry(node - 1, node, noise, self._walk))
 
-    def _tie(self, chain: Chain, begin_s: float, end_s: float) -> None:
+    def _walk_alike(self, chain: Chain, begin_s: float, end_s: float) -> None:
         first = next(iter(self._chains.values()))
         for tie in shared_walk(first, chain, begin_s, end_s, self.wandering.apart):
             self._enter(tie)
@@ -311,7 +312,7 @@ class PoseGraph(Estimate):
             alike_s = self._settings.alike_interval_s
             told_s = [time_s for time_s in chain.times_s if time_s % alike_s == 0.0]
             for before_s, time_s in itertools.pairwise(told_s):
-                self._tie(chain, before_s, time_s)
+                self._walk_alike(chain, before_s, time_s)
 
     def _enter(self, record: Record, *, active: bool = True) -> int:
         number, self._entered = self._entered, self._entered + 1

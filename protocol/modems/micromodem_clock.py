@@ -49,9 +49,10 @@ def parse_utc(text: str) -> datetime:
 
 def parse_version(text: str) -> tuple[int, ...] | None:
     """Return a firmware version like 2.0.27087 as numbers."""
-    parts = [integer(part) for part in text.split(".")]
-    numbers = tuple(part for part in parts if part is not None)
-    return numbers if len(numbers) == len(parts) else None
+    parts = text.split(".")
+    numbers = [integer(part) for part in parts if part.isdecimal()]
+    known = tuple(number for number in numbers if number is not None)
+    return known if len(known) == len(parts) else None
 
 
 class ModemClock:

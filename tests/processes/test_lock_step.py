@@ -175,6 +175,7 @@ def test_a_process_that_is_killed_is_waited_for_and_loses_nothing(tmp_path: Path
         def restart(missing: Sequence[RemoteNode]) -> None:
             if missing and missing[0].now_s > 0.0 and len(threads) == 2:
                 assert missing[0].now_s == 12.75
+                threads[1].join()  # until then its port is taken
                 threads.append(second.start())
 
         group.on_wait = restart

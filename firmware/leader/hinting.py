@@ -23,6 +23,9 @@ _CONTRADICTION = 2.0  # nats against a shift, beyond which a region does not go 
 _DATUM_FLOOR_M = 0.1  # of a depth offset: slopes and decoding shift the mean of an overlap
 _ASKEW_RAD = 0.03  # sigma of the axis of a hint along one only
 _UNLIKE = 0.1  # of the misfit of unrelated seabed: drift makes so much of the relief itself
+_FAINT = (
+    30.0  # misfit of unrelated seabed up to which depth may end a region, too: a plain's is 1 to 20
+)
 _NO_INFORMATION = 1e4  # variances of the prior
 
 
@@ -35,13 +38,14 @@ def hint_of(
     settings, surface = problem.settings, problem.strained(surface)
     cautious = _cautious(problem, surface, relief, prior)
     evidence = ambiguity.tempered_evidence(surface, cautious, problem.correlated_cells)
-    evidence -= _depth_misfit(problem, surface)
+    depth_misfit = _depth_misfit(problem, surface)
+    evidence -= depth_misfit
     found = ambiguity.posterior(surface, evidence, prior, settings.null_share)
     mean_m, covariance_m2 = ambiguity.moments(found, prior)
     root = np.linalg.cholesky(prior.covariance_m2)
     inverse = np.linalg.inv(root)
     left, axes = np.linalg.eigh(inverse @ covariance_m2 @ inverse.T)  # shares of the prior
-    contradicted = _contradicted(problem, surface, cautious)
+    contradicted = _contradicted(problem, surface, cautious, depth_misfit)
     sigmas = np.sqrt(np.maximum(left, _LEAST_SHARE))
     away = axes.T @ inverse @ _shifts_from(surface, mean_m) / sigmas[:, None]
     closed = np.array([_is_closed(away[k], away[1 - k], contradicted) for k in (0, 1)])
@@ -83,16 +87,22 @@ def _depth_misfit(problem: PairProblem, surface: ErrorSurface) -> Array:
     return np.asarray(2.0 * np.log1p(offset_m**2 / (3.0 * variance_m2)))
 
 
-def _contradicted(problem: PairProblem, surface: ErrorSurface, relief: Relief) -> NDArray[np.bool_]:
+def _contradicted(
+    problem: PairProblem, surface: ErrorSurface, relief: Relief, depth_misfit: Array
+) -> NDArray[np.bool_]:
     """Return at which shifts (K L,) that overlap the two sub-maps contradict each other.
 
     Misfit grows with the overlap wherever drift bends what is compared: it has to be a good part of
-    what unrelated seabed shows as well, lest it end a ridge that goes on.
+    what unrelated seabed shows as well, lest it end a ridge that goes on. Where relief is faint
+    depth tells as well. Elsewhere it does not: drift moves the mean depth of what overlaps of a
+    ridge.
     """
     least = float(surface.misfit.min())
     unlike = least + _UNLIKE * max(relief.background - least, 0.0)
     against = ambiguity.misfit_of(surface, relief.noise_scale, problem.correlated_cells)
     contradicted = (against >= _CONTRADICTION) & (surface.misfit >= unlike)
+    if relief.background <= _FAINT:
+        contradicted |= depth_misfit >= _CONTRADICTION
     return np.asarray(contradicted[np.isfinite(against)])
 
 
@@ -100,9 +110,8 @@ def _is_closed(along: Array, across: Array, contradicted: NDArray[np.bool_]) -> 
     """Return whether the region of likely shifts ends on both its sides along an axis.
 
     along and across (S,) are in sigmas of the region; it ends where all shifts abreast are
-    contradicted (S,). Where it goes on as far as the sub-maps overlap, as along a ridge or a
-    straight slope, it may go on beyond as well: that they overlap at all is then no more than a
-    guess.
+    contradicted (S,). Where it goes on as far as the sub-maps overlap, as along a ridge, it may go
+    on beyond as well: that they overlap at all is then no more than a guess.
     """
     band = np.abs(across) <= 1.0
     for side in (along, -along):

@@ -110,3 +110,36 @@ def test_on_a_slope_the_depth_tells_waves_apart_that_look_alike() -> None:
         gained += left_m2[0, 0] < 15.0**2
     assert gained >= 4
     assert np.mean(squares) < 3.0
+
+
+def test_on_a_smooth_slope_depth_ends_what_faint_relief_does_not() -> None:
+    """Long waves tell across the slope; along it there is nothing but depth."""
+
+    def slope_m(north_m: Array, east_m: Array) -> Array:
+        return np.asarray(60.0 + 0.02 * north_m + 0.3 * np.sin(np.pi * east_m / 100.0))
+
+    prior_m2, squares, away_m2, gained = 60.0**2 * np.eye(2), [], [], 0
+    for seed in range(10):
+        scene = Scene(seed)
+        truth_m = scene.rng.uniform(-45.0, 45.0, 2)
+        reference = scene.submap(200, 130, (60, 41), relief=slope_m, sigma_m=0.02)
+        query = scene.submap(
+            210,
+            150,
+            (60, 41),
+            shift_m=(truth_m[0], truth_m[1]),
+            relief=slope_m,
+            sigma_m=0.02,
+            offset_m=float(scene.rng.normal(0.0, 0.3)),
+        )
+        hint = match(reference, query, np.zeros(2), prior_m2, STILL).hint
+        if hint is None:
+            continue
+        left_m2 = np.linalg.inv(np.linalg.inv(prior_m2) + np.linalg.inv(hint.covariance_m2))
+        away_m = truth_m - left_m2 @ np.linalg.solve(hint.covariance_m2, hint.shift_m)
+        squares.append(float(away_m[0] ** 2 / left_m2[0, 0]))
+        away_m2.append(float(away_m[0] ** 2))
+        gained += left_m2[0, 0] < 0.4 * prior_m2[0, 0]
+    assert gained >= 6
+    assert np.mean(squares) < 1.0
+    assert np.mean(away_m2) < 20.0**2  # knowing nothing it would be 26 m

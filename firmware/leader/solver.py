@@ -27,6 +27,13 @@ _PLAIN = ("_ledger", "_robust_kernel", "_factorization", "rebuilds")
 _WORN = 1.3
 """ISAM2 eliminates the newest variables last, and fills: so much of that, and it is built anew."""
 
+_MOVED = 0.1
+"""Metres, m/s or rad from which a variable is linearised anew.
+
+Only directions of ranges and robust weights bend. A compass hardly turns so far: it is taken anew
+when ISAM2 is built, every ten minutes at least.
+"""
+
 _SETTLING_STEPS = 2  # a robust weight follows its residual one step late
 
 
@@ -201,7 +208,7 @@ def _new_isam(factorization: str) -> gtsam.ISAM2:
     """Return an empty ISAM2 that factorises by `QR` or `CHOLESKY`."""
     parameters = gtsam.ISAM2Params()
     parameters.setFactorization(factorization)
-    parameters.setRelinearizeThreshold(0.02)
+    parameters.setRelinearizeThreshold(_MOVED)
     parameters.relinearizeSkip = 1
     parameters.findUnusedFactorSlots = True  # memory stays with what is active
     return gtsam.ISAM2(parameters)

@@ -23,9 +23,7 @@ _CONTRADICTION = 2.0  # nats against a shift, beyond which a region does not go 
 _DATUM_FLOOR_M = 0.1  # of a depth offset: slopes and decoding shift the mean of an overlap
 _ASKEW_RAD = 0.03  # sigma of the axis of a hint along one only
 _UNLIKE = 0.1  # of the misfit of unrelated seabed: drift makes so much of the relief itself
-_FAINT = (
-    30.0  # misfit of unrelated seabed up to which depth may end a region, too: a plain's is 1 to 20
-)
+_FAINT = 30.0  # misfit of unrelated seabed up to which depth ends regions, too: a plain has 1 to 20
 _NO_INFORMATION = 1e4  # variances of the prior
 
 

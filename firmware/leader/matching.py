@@ -19,7 +19,7 @@ from firmware.submaps import GriddedSubmap
 from protocol.errors import EstimationError
 
 _FREE_M = 1e4  # of a one-axis closure across it: nothing, however often it is said
-_NEGLIGIBLE = 1e-6  # mass beside the best lattice shift's that is not worth refining
+_NEGLIGIBLE = 1e-4  # mass beside the best lattice shift's that is not worth refining
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

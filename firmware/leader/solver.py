@@ -34,8 +34,6 @@ Only directions of ranges and robust weights bend. A compass hardly turns so far
 when ISAM2 is built, every ten minutes at least.
 """
 
-_SETTLING_STEPS = 2  # a robust weight follows its residual one step late
-
 
 class Solver:
     """Estimates and covariances of the variables that a ledger speaks of."""
@@ -149,9 +147,8 @@ class Solver:
         result = self._isam.update(added, self._fresh, removed)
         for number, slot in zip(numbers, result.getNewFactorsIndices(), strict=True):
             self._ledger[number].slot = slot
-        for _ in range(_SETTLING_STEPS if numbers or removed else 0):
-            if self._isam.update().getVariablesRelinearized() == 0:
-                break
+        if numbers or removed:
+            self._isam.update()  # a robust weight follows its residual one step late
         self._values = self._isam.calculateEstimate()
 
     def _rebuild(self, values: gtsam.Values) -> None:

@@ -79,7 +79,7 @@ class SoundingBins:
         keys = _keys_of(soundings_ned_m[:, :2], self._cell_m)
         order = np.argsort(keys, kind="stable")
         keys, soundings_ned_m, times_s = keys[order], soundings_ned_m[order], times_s[order]
-        self._make_room(np.unique(keys))
+        self._make_room(keys[_is_first(keys)])
         while self._keys.size > self._settings.max_cells:
             self._coarsen()
             keys = _halved(keys)
@@ -87,10 +87,13 @@ class SoundingBins:
             keys, soundings_ned_m, times_s = keys[order], soundings_ned_m[order], times_s[order]
         self._accumulate(np.searchsorted(self._keys, keys), soundings_ned_m, times_s)
 
-    def _make_room(self, new: NDArray[np.int64]) -> None:
-        merged = np.union1d(self._keys, new)
-        if merged.size == self._keys.size:
+    def _make_room(self, keys: NDArray[np.int64]) -> None:
+        """Make cells of the keys, ascending, that have none yet."""
+        at = np.searchsorted(self._keys, keys)
+        is_new = np.append(self._keys, -1)[at] != keys
+        if not is_new.any():
             return
+        merged = np.insert(self._keys, at[is_new], keys[is_new])
         old = np.searchsorted(merged, self._keys)
         self._sums = _scattered(self._sums, old, merged.size, 0.0)
         self._reference_m = _scattered(self._reference_m, old, merged.size, np.nan)
@@ -296,8 +299,13 @@ def _halved(keys: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def _rank(rows: NDArray[np.intp]) -> NDArray[np.intp]:
     """Return 0, 1, 2 ... within each run of equal values."""
-    first = np.flatnonzero(np.r_[True, rows[1:] != rows[:-1]]) if rows.size else rows
+    first = np.flatnonzero(_is_first(rows))
     return np.arange(rows.size) - np.repeat(first, np.diff(np.r_[first, rows.size]))
+
+
+def _is_first(ordered: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Return which of the ascending values differ from the one before."""
+    return np.asarray(np.diff(ordered, prepend=ordered[:1] - 1) != 0)
 
 
 def _median(values: NDArray[D]) -> Array:

@@ -89,7 +89,12 @@ def sheet_of(
 
 def overlap_m2(origin: Sheet, target: Sheet, shifts_m: Array) -> Array:
     """Return the area (S,) that two footprints share when target is moved by shifts_m (S, 2)."""
-    low = np.floor(origin.tiles_m.min(axis=0) / FOOTPRINT_M).astype(int)
+    first_m, last_m = origin.tiles_m.min(axis=0), origin.tiles_m.max(axis=0)
+    begins_m = target.tiles_m.min(axis=0) + shifts_m.min(axis=0)
+    ends_m = target.tiles_m.max(axis=0) + shifts_m.max(axis=0)
+    if np.any(begins_m > last_m + FOOTPRINT_M) or np.any(ends_m < first_m - FOOTPRINT_M):
+        return np.zeros(len(shifts_m))  # so are most, and this is soon told
+    low = np.floor(first_m / FOOTPRINT_M).astype(int)
     cells = np.floor(origin.tiles_m / FOOTPRINT_M).astype(int) - low
     occupied = np.zeros(cells.max(axis=0) + 1, dtype=bool)
     occupied[cells[:, 0], cells[:, 1]] = True

@@ -19,6 +19,7 @@ from protocol.settings import Settings, setting
 
 _SMOOTHING_CELLS = 0.5  # of slopes, as in the match
 _ITERATIONS = 4  # the shift's prior keeps the fit near its start
+_SETTLED_M = 0.05  # as in the match
 _LONGEST_STEP_M = 3.0  # gradients are not believed farther than their smoothing
 
 
@@ -144,6 +145,8 @@ def _evidence_of(
         unknowns = system.solved(known)
         length = float(np.hypot(*unknowns[:2]))
         shift = shift - unknowns[:2] * min(1.0, _LONGEST_STEP_M / max(length, 1e-9))
+        if length < _SETTLED_M:
+            break
     if system is None or not system.misfit(system.solved(known)) <= settings.misfit_limit:
         return None
     return system.evidence(max(system.misfit(system.solved(known)), 1.0))

@@ -12,6 +12,7 @@ import numpy as np
 
 from firmware.geometry import Array
 from firmware.leader.alignment import Aligned, NoiseModel, align, fields_of
+from firmware.leader.refinement import SETTLED_M, limited
 from firmware.leader.screening import land, prepare, sample
 from firmware.leader.swath import Swath
 from firmware.submaps import GriddedSubmap
@@ -19,8 +20,6 @@ from protocol.settings import Settings, setting
 
 _SMOOTHING_CELLS = 0.5  # of slopes, as in the match
 _ITERATIONS = 4  # the shift's prior keeps the fit near its start
-_SETTLED_M = 0.05  # as in the match
-_LONGEST_STEP_M = 3.0  # gradients are not believed farther than their smoothing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,9 +142,8 @@ def _evidence_of(
         system.normal[:2, :2] += inverse
         system.right[:2] += inverse @ (shift - overlap.shift_m)
         unknowns = system.solved(known)
-        length = float(np.hypot(*unknowns[:2]))
-        shift = shift - unknowns[:2] * min(1.0, _LONGEST_STEP_M / max(length, 1e-9))
-        if length < _SETTLED_M:
+        shift = shift - limited(unknowns[:2])
+        if np.hypot(*unknowns[:2]) < SETTLED_M:
             break
     if system is None or not system.misfit(system.solved(known)) <= settings.misfit_limit:
         return None

@@ -7,7 +7,7 @@ from firmware.leader.alignment import Aligned, NoiseModel, align, design_of
 from firmware.leader.screening import Layer
 
 _ITERATIONS = 8  # from the lattice's best cell it settles in four to six
-_SETTLED_M = 0.05  # an eighth of the strain that no match can see
+SETTLED_M = 0.05  # an eighth of the strain that no match can see
 _FARTHEST = 4.0  # of a step: how far it may be believed to lead on
 _LONGEST_STEP_M = 3.0  # gradients are not believed further than their smoothing
 
@@ -35,9 +35,9 @@ def refine(
         length = float(np.hypot(*step))
         if not np.isfinite(length):
             return None
-        moved = _limited(step if last is None else _accelerated(step, last, moved))
+        moved = limited(step if last is None else _accelerated(step, last, moved))
         shift, last = shift + moved, step
-        if length < _SETTLED_M:
+        if length < SETTLED_M:
             break
     if np.hypot(*(shift - start_m)) > 4.0 * reference.grid.cell_m + _LONGEST_STEP_M:
         return None
@@ -51,7 +51,8 @@ def _accelerated(step: Array, last: Array, moved: Array) -> Array:
     return np.asarray(step - np.clip(share, 1.0 - _FARTHEST, 0.5) * (change + moved))
 
 
-def _limited(move_m: Array) -> Array:
+def limited(move_m: Array) -> Array:
+    """Return a move (2,) no longer than gradients are believed."""
     return np.asarray(move_m * min(1.0, _LONGEST_STEP_M / max(float(np.hypot(*move_m)), 1e-12)))
 
 

@@ -16,7 +16,7 @@ from firmware.leader.estimate import Estimate
 from firmware.leader.matches import MatchingSettings, MatchOutcome, NoMatch
 from firmware.leader.matching import match
 from firmware.leader.nonconvexity import Doubt
-from firmware.leader.offsets import Offset, corrections, offsets_of
+from firmware.leader.offsets import Offset, anchor_of, corrections, offsets_of
 from firmware.leader.pairing import Calibrations, Side, side_of, strain_m
 from firmware.submaps import GriddedSubmap
 
@@ -129,22 +129,20 @@ def jobs_for(
 
 def jobs_again(
     sheet: Sheet,
-    partners: list[tuple[Sheet, float, int | None]],
+    partners: list[tuple[Offset, float, int | None]],
     estimate: Estimate,
     settings: ClosureSettings,
     calibrations: Calibrations,
 ) -> list[MatchJob]:
     """Return the matches of a sheet's open pairs whose offset is known much better by now.
 
-    partners come with the radius at the last look and the number of the hint that a look has left,
-    if any: what the pair itself told is taken out of what is known, lest it confirm itself. Raises
-    EstimationError if the sheet itself hangs on no node.
+    Offsets of the sheet come with the radius at the last look and the number of the hint that a
+    look has left, if any: what the pair itself told is taken out of what is known, lest it confirm
+    itself.
     """
-    last_look = {other.id: (radius_m, hint) for other, radius_m, hint in partners}
     shrunk = []
-    for known in offsets_of(sheet, [other for other, _, _ in partners], estimate):
-        radius_m, hint = last_look[known.origin.id]
-        offset = known if hint is None else _without_hint(known, sheet, hint, estimate)
+    for known, radius_m, hint in partners:
+        offset = known if hint is None else _without_hint(known, hint, estimate)
         values_m2 = np.linalg.eigvalsh(offset.covariance_m2)
         if (
             0.0 < values_m2[0]
@@ -157,14 +155,14 @@ def jobs_again(
         estimate,
         settings,
         calibrations,
-        have_hints={other for other, (_, hint) in last_look.items() if hint is not None},
+        have_hints={known.origin.id for known, _, hint in partners if hint is not None},
     )
 
 
-def _without_hint(offset: Offset, sheet: Sheet, hint: int, estimate: Estimate) -> Offset:
+def _without_hint(offset: Offset, hint: int, estimate: Estimate) -> Offset:
     """Return an offset as if its hint had not been told; the ways to the nodes stay as they are."""
-    other, told = offset.origin, estimate.closure(hint)
-    reckoned_m = sheet.reckoned_at(sheet.time_s) - other.reckoned_at(other.time_s)
+    origin, target, told = offset.origin, offset.target, estimate.closure(hint)
+    reckoned_m = target.reckoned_at(target.time_s) - origin.reckoned_at(origin.time_s)
     return offset.without(told.offset_m - reckoned_m, told.covariance_m2)
 
 
@@ -183,12 +181,13 @@ def _ranked(
     ]
     if not others:
         return []
+    anchor_of(sheet, estimate)  # one that hangs on no node has no matches
     moves_m = corrections([sheet, *others], estimate)
     centres_m = np.array([other.centre_m for other in others]) + moves_m[1:]
     distances_m = np.hypot(*(centres_m - sheet.centre_m - moves_m[0]).T)
     nearest = np.argsort(distances_m, kind="stable")[: settings.screened_per_submap]
     ranked = []
-    for offset in offsets_of(sheet, [others[k] for k in nearest], estimate):
+    for offset in offsets_of([(others[k], sheet) for k in nearest], estimate):
         shifts_m = offset.shift_m + _spread(offset.covariance_m2)
         area_m2 = overlap_m2(offset.origin, sheet, shifts_m).mean()
         if area_m2 >= settings.expected_overlap_m2:

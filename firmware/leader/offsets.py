@@ -1,12 +1,13 @@
 """Where sheets lie by the estimate, and their offsets from each other before any match."""
 
 import contextlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from firmware.geometry import Array
-from firmware.leader.atlas import Sheet
+from firmware.leader.atlas import Sheet, SheetId
 from firmware.leader.drifts import Drifts
 from firmware.leader.estimate import Estimate
 from firmware.leader.ledger import Anchor
@@ -19,7 +20,7 @@ _TINY_M2 = 1e-6  # two sub-maps of one node have no offset
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Offset:
-    """The offset of a sheet from another one, the origin, as the estimate has it.
+    """The offset of a sheet, the target, from another one, the origin, as the estimate has it.
 
     shift_m (2,) is to be added to the offset by dead reckoning, each sheet's at its own time;
     covariance_m2 (2, 2) is that of the offset, of which apart_m2 is the part that lies within the
@@ -27,6 +28,7 @@ class Offset:
     """
 
     origin: Sheet
+    target: Sheet
     shift_m: Array
     covariance_m2: Array
     apart_m2: Array
@@ -61,35 +63,42 @@ def _worst_m(covariance_m2: Array) -> float:
     return float(np.sqrt(max(np.linalg.eigvalsh(covariance_m2)[-1], 0.0)))
 
 
-def offsets_of(sheet: Sheet, others: list[Sheet], estimate: Estimate) -> list[Offset]:
-    """Return the offsets of a sheet from others.
+def offsets_of(pairs: Sequence[tuple[Sheet, Sheet]], estimate: Estimate) -> list[Offset]:
+    """Return the offset of the second sheet of each pair from the first.
 
-    Those that hang on no node are left out: frames were lost there. Raises EstimationError if the
-    sheet itself hangs on none.
+    All share one joint covariance: that is what costs. Pairs with a sheet that hangs on no node
+    are left out: frames were lost there. Raises EstimationError if the information matrix is
+    singular.
     """
-    anchors, placed = [anchor_of(sheet, estimate)], []
-    for other in others:
+    sheets = {sheet.id: sheet for pair in pairs for sheet in pair}
+    anchors = dict[SheetId, Anchor]()
+    for sheet in sheets.values():
         with contextlib.suppress(EstimationError):
-            anchors.append(anchor_of(other, estimate))
-            placed.append(other)
-    joint = estimate.state_covariance(anchors)
-    ends = np.array([joint[[k, 0]][:, :, [k, 0]] for k in range(1, len(anchors))])
-    ends = ends.reshape(-1, 8, 8)  # of each pair, the other's state first
-    covariances_m2 = _BETWEEN @ ends @ _BETWEEN.T
+            anchors[sheet.id] = anchor_of(sheet, estimate)
+    placed = [pair for pair in pairs if all(sheet.id in anchors for sheet in pair)]
+    if not placed:
+        return []
+    rows = {sheet_id: row for row, sheet_id in enumerate(anchors)}
+    ends = np.array([[rows[origin.id], rows[target.id]] for origin, target in placed])
+    joint = estimate.state_covariance(list(anchors.values()))
+    both = joint[ends[:, :, None], :, ends[:, None, :], :]  # (pairs, end, end, 4, 4)
+    both = both.swapaxes(2, 3).reshape(-1, 8, 8)
+    covariances_m2 = _BETWEEN @ both @ _BETWEEN.T
     known = np.linalg.inv(covariances_m2 + _TINY_M2 * np.eye(2))
-    gains = _DRIFTS @ ends @ _BETWEEN.T @ known
+    gains = _DRIFTS @ both @ _BETWEEN.T @ known
     told = gains @ covariances_m2 @ gains.swapaxes(1, 2)
-    left = _DRIFTS @ ends @ _DRIFTS.T - told
-    moves_m = corrections([sheet, *placed], estimate)
+    left = _DRIFTS @ both @ _DRIFTS.T - told
+    moves_m = corrections([sheets[sheet_id] for sheet_id in anchors], estimate)
     return [
         Offset(
-            origin=other,
-            shift_m=moves_m[0] - moves_m[k],
-            covariance_m2=covariances_m2[k - 1],
-            apart_m2=anchors[0].apart_m2 + anchors[k].apart_m2,
-            drifts=Drifts(gain=gains[k - 1], left=left[k - 1]),
+            origin=origin,
+            target=target,
+            shift_m=moves_m[end[1]] - moves_m[end[0]],
+            covariance_m2=covariances_m2[k],
+            apart_m2=anchors[origin.id].apart_m2 + anchors[target.id].apart_m2,
+            drifts=Drifts(gain=gains[k], left=left[k]),
         )
-        for k, other in enumerate(placed, start=1)
+        for k, ((origin, target), end) in enumerate(zip(placed, ends, strict=True))
     ]
 
 

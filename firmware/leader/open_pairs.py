@@ -16,6 +16,7 @@ from firmware.leader.closures import enter_hint
 from firmware.leader.judgement import Judgement
 from firmware.leader.match_jobs import MatchJob, jobs_again
 from firmware.leader.matches import MatchOutcome, NoMatch
+from firmware.leader.offsets import offsets_of
 from firmware.leader.pairing import Calibrations
 from firmware.leader.pose_graph import PoseGraph
 from protocol.errors import EstimationError
@@ -85,48 +86,60 @@ class OpenPairs:
         if not pairs:
             self._of.pop(target, None)
 
-    def next_turn(
-        self, atlas: Atlas, graph: PoseGraph
-    ) -> tuple[Sheet, list[tuple[Sheet, float, int | None]]] | None:
-        """Return the sheet whose turn it is, and its open partners with radius in m and hint.
-
-        Sheets take turns; one that is matched no more is forgotten. A partner whose hint was
-        composed with others is passed over: nobody knows any more what the pair itself has told.
-        """
-        while self._of:
-            target, pairs = self._of.popitem(last=False)
-            partners = [
-                (atlas[origin], pair.radius_m, pair.hint if graph.is_active(pair.hint) else None)
-                for origin, pair in pairs.items()
-                if origin in atlas and (pair.hint is None or pair.hint in graph)
-            ]
-            if target in atlas and partners:
-                self._of[target] = pairs
-                return atlas[target], partners
-        return None
-
     def second_looks(
         self, sheet: Sheet, atlas: Atlas, graph: PoseGraph, calibrations: Calibrations
     ) -> list[MatchJob]:
         """Return matches of open pairs whose offset is known better by now, beside a new sheet.
 
-        Each sheet has one turn at most, and no more pairs than the new one's are tried.
+        Once there are as many as the new sheet may have, the other sheets keep their turn.
         """
-        seen, looks = {sheet.id}, list[MatchJob]()
-        for _ in range(self._settings.second_looks):
-            turn = self.next_turn(atlas, graph)
-            if turn is None or turn[0].id in seen or len(looks) >= self._settings.pairs_per_submap:
+        turns, looks = self.turns(sheet, atlas, graph), list[MatchJob]()
+        pairs = [(partner, target) for target, partners in turns for partner, _ in partners]
+        try:
+            offsets = {(o.origin.id, o.target.id): o for o in offsets_of(pairs, graph)}
+        except EstimationError:
+            offsets = {}
+        for target, partners in turns:
+            if len(looks) >= self._settings.pairs_per_submap:
                 break
-            seen.add(turn[0].id)
+            self._of.move_to_end(target.id)
+            known = [
+                (offsets[partner.id, target.id], pair.radius_m, pair.hint)
+                for partner, pair in partners
+                if (partner.id, target.id) in offsets
+            ]
+            self.counters["second_looks_unplaceable"] += not known
             try:
-                looks += jobs_again(*turn, graph, self._settings, calibrations)
-            except EstimationError:
-                self.counters["second_looks_unplaceable"] += 1
+                looks += jobs_again(target, known, graph, self._settings, calibrations)
             except Exception:
-                LOG.exception("second looks at %s failed", turn[0].id)
+                LOG.exception("second looks at %s failed", target.id)
                 self.counters["second_looks_raised"] += 1
         self.counters["second_looks"] += len(looks)
         return looks
+
+    def turns(
+        self, beside: Sheet, atlas: Atlas, graph: PoseGraph
+    ) -> list[tuple[Sheet, list[tuple[Sheet, OpenPair]]]]:
+        """Return the sheets that were not looked at for longest, with the partners of each.
+
+        The new one that they go beside is none of them. Sheets that are matched no more are
+        forgotten. A partner whose hint was composed with others is passed over: nobody knows any
+        more what the pair itself has told.
+        """
+        turns = list[tuple[Sheet, list[tuple[Sheet, OpenPair]]]]()
+        for target, pairs in list(self._of.items()):
+            if len(turns) == self._settings.second_looks:
+                break
+            partners = [
+                (atlas[origin], pair if graph.is_active(pair.hint) else replace(pair, hint=None))
+                for origin, pair in pairs.items()
+                if origin in atlas and (pair.hint is None or pair.hint in graph)
+            ]
+            if target not in atlas or not partners:
+                del self._of[target]
+            elif target != beside.id:
+                turns.append((atlas[target], partners))
+        return turns
 
     def keep_or_settle(
         self,

@@ -22,6 +22,7 @@ def test_few_pairs_of_which_a_match_can_tell_no_more_are_tried(
     """The ways within the composed past stay as they are, however often places are matched."""
     offset = Offset(
         origin=MagicMock(),
+        target=MagicMock(),
         shift_m=np.zeros(2),
         covariance_m2=sigma_m**2 * np.eye(2),
         apart_m2=apart_m**2 * np.eye(2),

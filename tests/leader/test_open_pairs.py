@@ -82,12 +82,11 @@ def atlas() -> Atlas:
 def _assert_turn(
     pairs: OpenPairs, atlas: Atlas, graph: PoseGraph, target: Sheet, origin: Sheet, radius_m: float
 ) -> None:
-    turn = pairs.next_turn(atlas, graph)
-    assert turn is not None
-    assert turn[0] is target
-    ((partner, last_m, hint),) = turn[1]
-    assert (partner, hint) == (origin, None)
-    assert last_m == pytest.approx(radius_m)
+    ((looked_at, partners),) = pairs.turns(_sheet(9), atlas, graph)
+    assert looked_at is target
+    ((partner, pair),) = partners
+    assert (partner, pair.hint) == (origin, None)
+    assert pair.radius_m == pytest.approx(radius_m)
 
 
 def _sheets(atlas: Atlas) -> list[Sheet]:
@@ -113,18 +112,21 @@ def test_settled_and_impossible_pairs_are_forgotten(atlas: Atlas, graph: PoseGra
     pairs.settle(first.id, third.id)
     _assert_turn(pairs, atlas, graph, third, second, 16.0)
     pairs.note(_job(second, third, 3.0), UNSETTLED)
-    assert pairs.next_turn(atlas, graph) is None
+    assert pairs.turns(_sheet(9), atlas, graph) == []
     assert len(pairs) == 0
 
 
 def test_sheets_take_turns_and_shelved_ones_are_left_out(atlas: Atlas, graph: PoseGraph) -> None:
     first, second, third, fourth = _sheets(atlas)
-    pairs = OpenPairs(ClosureSettings())
+    pairs = OpenPairs(ClosureSettings(second_looks=1))
     for target in (second, third, fourth):
         pairs.note(_job(first, target, 16.0), AMBIGUOUS)
     atlas.shelve(third.id)
-    turns = [pairs.next_turn(atlas, graph) for _ in range(3)]
-    assert [turn[0].id.submap for turn in turns if turn is not None] == [1, 3, 1]
+    turns = []
+    for _ in range(3):
+        turns += [target for target, _ in pairs.turns(_sheet(9), atlas, graph)]
+        pairs.second_looks(_sheet(9), atlas, graph, Calibrations(MatchingSettings()))
+    assert turns == [second, fourth, second]
 
 
 def test_longest_unseen_sheets_go_when_there_are_too_many(atlas: Atlas) -> None:
@@ -143,7 +145,7 @@ def test_pair_whose_hint_was_composed_away_is_passed_over(atlas: Atlas, graph: P
     pairs.note_hint(first.id, second.id, 10_000)
     assert pairs.hint(first.id, second.id) == 10_000
     assert 10_000 not in graph
-    assert pairs.next_turn(atlas, graph) is None
+    assert pairs.turns(_sheet(9), atlas, graph) == []
 
 
 def _two_sheets() -> tuple[Sheet, Sheet]:
@@ -158,7 +160,8 @@ def _two_sheets() -> tuple[Sheet, Sheet]:
 def _looks(graph: PoseGraph, then_m: float, hint: int | None = None) -> list[MatchJob]:
     origin, target = _two_sheets()
     calibrations = Calibrations(MatchingSettings())
-    return jobs_again(target, [(origin, then_m, hint)], graph, ClosureSettings(), calibrations)
+    (offset,) = offsets_of([(origin, target)], graph)
+    return jobs_again(target, [(offset, then_m, hint)], graph, ClosureSettings(), calibrations)
 
 
 def test_only_a_much_better_known_offset_is_worth_a_second_look(graph: PoseGraph) -> None:
@@ -189,7 +192,7 @@ def test_what_the_pair_itself_has_told_does_not_make_it_better_known(graph: Pose
 
 def test_offset_tells_drift_as_the_time_between_the_sheets_says(graph: PoseGraph) -> None:
     origin, target = _two_sheets()
-    (offset,) = offsets_of(target, [origin], graph)
+    (offset,) = offsets_of([(origin, target)], graph)
     apart_s, known_m2 = target.time_s - origin.time_s, offset.covariance_m2
     assert offset.drifts.gain == pytest.approx(np.tile(-np.eye(2) / apart_s, (2, 1)), rel=0.1)
     drifts = offset.drifts.covariance(known_m2)

@@ -86,9 +86,8 @@ class FollowerCore:
         state = self._reckoning.receive_odometry(odometry)
         if state is before:
             return
-        while self._track and self._track[-1].time_s > state.time_s:  # the clock was set back
-            self._track.pop()
-            self._last_submap_s = min(self._last_submap_s, state.time_s)
+        if state.time_s < before.time_s:
+            self._set_back(before.time_s, state.time_s)
         if self._reckoning.lost_s > 0.0:
             self._correction.lose(state.time_s - self._reckoning.lost_s, state.time_s)
         if self._reckoning.is_lost:
@@ -192,6 +191,13 @@ class FollowerCore:
         torn = self._builder.take()
         if torn is not None:
             self._begin_fit(torn)
+
+    def _set_back(self, from_s: float, to_s: float) -> None:
+        """Forget the times that are yet to come: the clock was set back."""
+        while self._track and self._track[-1].time_s > to_s:
+            self._track.pop()
+            self._last_submap_s = min(self._last_submap_s, to_s)
+        self._correction.set_back(from_s, to_s)
 
     def _begin_boot(self) -> None:
         """Tell the leader that dead reckoning begins anew, as after a restart."""

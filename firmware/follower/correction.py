@@ -7,7 +7,7 @@ reckoning itself.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -176,6 +176,18 @@ class DriftCorrection:
             first, second = self._lost[:2]
             both_m2 = first.variance_m2 + second.variance_m2
             self._lost[:2] = [LostSpan(time_s=second.time_s, variance_m2=both_m2)]
+
+    def set_back(self, from_s: float, to_s: float) -> None:
+        """Let what is known by now be known at the time to which the clock was set back.
+
+        Where all that was seen is older than that it keeps its times.
+        """
+        self._lost = [replace(lost, time_s=min(lost.time_s, to_s)) for lost in self._lost]
+        self._losing_s = (np.inf, -np.inf)
+        newest = self._seen[-1].state if self._seen else self._base
+        if newest.time_s > to_s:
+            now = self._filter.predicted(newest, max(from_s, newest.time_s))
+            self._base, self._seen, self._aside = replace(now, time_s=to_s), [], None
 
     def corrected(self, time_s: float, reckoned_m: Array) -> tuple[Array, Array]:
         """Return the believed position (2,) at the time, and its covariance (2, 2)."""

@@ -261,3 +261,22 @@ def test_a_range_heard_while_navigation_is_lost_is_held_against_the_doubt_so_far
     mean, covariance = state.blended()
     assert np.abs(mean[2:4] - BIAS_MPS).max() < 3.0 * np.sqrt(covariance[2, 2])
     assert covariance[0, 0] > 250.0**2 * 0.5
+
+
+def test_what_was_learned_by_a_clock_that_was_ahead_stays_when_it_is_set_right() -> None:
+    correction = taught(1200.0)
+    correction.set_back(1260.0, 260.0)
+    ran_away_m = drift_m(1260.0)  # and the tide turns
+    position_m, covariance_m2 = correction.corrected(260.0, ran_away_m)
+    assert np.abs(position_m).max() < 3.0 * np.sqrt(covariance_m2[0, 0])
+    for time_s in np.arange(280.0, 880.0, 40.0):
+        ran_away_m = ran_away_m - 40.0 * BIAS_MPS
+        assert correction.receive_answer(float(time_s), ran_away_m, np.zeros(2))
+    assert correction.corrected(840.0, ran_away_m)[0] == pytest.approx([0.0, 0.0], abs=3.0)
+
+
+def test_a_clock_set_back_by_less_than_answers_are_old_leaves_them_their_times() -> None:
+    correction = taught(600.0)
+    correction.set_back(700.0, 690.0)
+    assert correction.receive_answer(640.0, drift_m(640.0), np.zeros(2))
+    assert correction.stale == 0

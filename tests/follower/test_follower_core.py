@@ -351,6 +351,37 @@ def test_track_that_is_told_after_a_clock_was_set_back_is_in_order() -> None:
     assert core.status()["odometry_set_back"] == 1
 
 
+def test_a_clock_that_leaps_ahead_and_comes_back_leaves_an_honest_belief() -> None:
+    """What was doubted of the hour that never was is doubted of now: answers end it."""
+    core, drift_mps, last_m = follower_of(line(0.0, 0.0)), 0.1, np.nan
+    for time_s in np.arange(0.25, 800.0, 0.25):
+        shown_s = time_s + (3600.0 if 600.0 <= time_s < 603.0 else 0.0)
+        core.receive_odometry(
+            Odometry(
+                time_s=shown_s,
+                velocity_north_mps=2.0,
+                velocity_east_mps=0.0,
+                yaw_rad=0.0,
+                depth_m=10.0,
+            )
+        )
+        last_m = core.reckoned.north_m - drift_mps * time_s
+        if time_s % 20.0 == 0.0 and time_s >= 100.0:
+            said_m = last_m - (2.0 - drift_mps) * 40.0
+            answer = answer_of(
+                time_s - 40.0,
+                said_m,
+                0.0,
+                fragment_count=core.boot_epoch,
+                submap=answer_count(1.5, round(time_s)),
+            )
+            if not 600.0 <= time_s < 640.0:
+                core.receive_frame(answer, None, time_s)
+    belief = core.belief()
+    assert belief.position_m[0] == pytest.approx(last_m, abs=3.0)
+    assert np.sqrt(belief.covariance_m2[0, 0]) < 10.0
+
+
 def test_navigation_that_fails_for_a_while_is_counted_and_goes_on() -> None:
     core = surveyed()
     core.receive_odometry(

@@ -183,12 +183,12 @@ class Reassembler:
         self._place(key, slot, packet, arrival_s)
 
     def advance(self, now_s: float) -> None:
-        """Close the transfers whose deadline has passed."""
+        """Close the transfers whose deadline has passed, or was set back as far as that."""
         for key, slot in list(self._slots.items()):
             overtaken = slot.overtaken_at_s
-            if overtaken is not None and now_s - overtaken >= self._patience_s(slot):
+            if overtaken is not None and abs(now_s - overtaken) >= self._patience_s(slot):
                 self._close(key, "overtaken")
-            elif now_s - slot.first_arrival_s >= self._settings.oldest_s:
+            elif abs(now_s - slot.first_arrival_s) >= self._settings.oldest_s:
                 self._close(key, "too-old")
 
     def flush(self) -> None:

@@ -97,6 +97,14 @@ def test_an_old_transfer_closes_by_age_alone() -> None:
     assert [t.reason for t in transfers(reassembler)] == ["too-old"]
 
 
+def test_a_clock_that_is_set_back_keeps_no_transfer_open() -> None:
+    reassembler = Reassembler(SETTINGS)
+    reassembler.receive(submap(3)[0], 4000.0)
+    reassembler.receive(submap(4)[0], 4001.0)
+    reassembler.advance(400.0)
+    assert [t.submap for t in transfers(reassembler)] == [3, 4]
+
+
 def test_duplicates_and_late_fragments_are_counted_and_change_nothing() -> None:
     reassembler = Reassembler(SETTINGS)
     sent = submap(3)

@@ -100,8 +100,8 @@ def without_parity(points_ned_m: NDArray[np.float32] | Array, steps: Steps) -> A
 def completed(fragments: Mapping[int, Float32], mean_depth_m: np.float32) -> tuple[Array, int]:
     """Return all points (M, 3) to be had from fragments (15, 3), and how many were recovered.
 
-    Without parity, when too little of it arrived, or where the mean depth means nothing, these are
-    the points that arrived.
+    Without parity, or where the mean depth means nothing, these are the points that arrived. When
+    too much was lost to tell whether there is parity, they are the same, rounded to its steps.
     """
     arrived = [np.asarray(fragments[i], dtype=np.float64) for i in sorted(fragments)]
     points = np.concatenate(arrived)
@@ -117,13 +117,15 @@ def completed(fragments: Mapping[int, Float32], mean_depth_m: np.float32) -> tup
     scaled = points / steps.sizes_m
     index = np.round(scaled).astype(np.int64)
     whole = index * steps.sizes_m
-    if len(fragments) == PAPER_FRAGMENTS:
-        return whole, 0
     payload = np.clip(np.floor((scaled - index + 0.5) * 256.0), 0, 255).astype(np.uint8)
     lost = [i for i in range(PAPER_FRAGMENTS) if i not in fragments]
+    if _DATA_BYTES * len(lost) > _PARITY_BYTES * len(fragments):
+        return whole, 0
     try:
         data = _data_of(sorted(fragments), index, payload)
     except RemoteProtocolError:
+        return points, 0
+    if not lost:
         return whole, 0
     centre = np.median(index, axis=0).astype(np.int64)
     centre[2] = round(float(mean_depth_m) / steps.sizes_m[2])

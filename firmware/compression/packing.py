@@ -58,7 +58,7 @@ def packets_from(
     to the place of its whole second since the first; places without a state are NaN.
     """
     if isinstance(compressed, CompressedCode):
-        return _fragments(compressed, _bodies(compressed, encode_track(track)), header)
+        return _fragments(compressed, _bodies(compressed, track), header)
     points = fragment_points(compressed)
     states = states_by_second(track, STATES_PER_FRAGMENT * len(points))
     packets = []
@@ -86,15 +86,15 @@ def filled_bytes(profile: Profile, settings: CompressionSettings) -> int:
     return BODY_BYTES[profile.sealed if settings.sealed else profile]
 
 
-def _bodies(compressed: CompressedCode, track: bytes) -> list[bytes]:
+def _bodies(compressed: CompressedCode, track: Track) -> list[bytes]:
     settings, frames = compressed.settings, compressed.fragment_count
     size = filled_bytes(compressed.profile, settings)
-    code = compressed.code
+    told, code = encode_track(track, size // 2), compressed.code
     if isinstance(code, DenseDraft):
         code = _coded(code)
     if isinstance(code, DenseCode):
-        return dense_bodies(code, track, size, frames)
-    return lattice_bodies(code, track, size, frames, settings)
+        return dense_bodies(code, told, size, frames)
+    return lattice_bodies(code, told, size, frames, settings)
 
 
 def _coded(draft: DenseDraft) -> DenseCode:

@@ -1,5 +1,6 @@
 """Whatever the packets say, the leader is bounded: a grid, or one EstimationError."""
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -19,7 +20,7 @@ from firmware.compression.packing import submap_header
 from firmware.compression.settings import CompressionSettings
 from firmware.compression.steps import run
 from firmware.compression.track_code import decode_track, encode_track
-from firmware.geometry import Array
+from firmware.geometry import Array, wrap_angle
 from firmware.leader.reconstruction import (
     ReconstructionSettings,
     reconstruct_packets,
@@ -126,6 +127,25 @@ def test_a_turning_track_fits_forty_bytes_within_a_metre() -> None:
     assert taken == len(data) <= 46
     assert np.abs(track.north_m - turning_track().north_m).max() < 1.0
     assert np.abs(track.east_m - turning_track().east_m).max() < 1.0
+
+
+@pytest.mark.parametrize("turn_deg", [-400.0, 200.0, 270.0, 700.0])
+def test_yaw_of_a_vehicle_that_circles_is_told(turn_deg: float) -> None:
+    yaw_rad = np.radians(turn_deg) * np.linspace(0.0, 1.0, 40)
+    circling = dataclasses.replace(turning_track(), yaw_rad=yaw_rad)
+    track, _ = decode_track(encode_track(circling), 0.0)
+    assert np.abs(wrap_angle(track.yaw_rad - yaw_rad)).max() < np.radians(6.0)
+
+
+@pytest.mark.parametrize("sealed", [False, True])
+def test_small_frames_hold_a_map_in_a_turn(survey: Survey, *, sealed: bool) -> None:
+    settings = CompressionSettings(small_frames=True, sealed=sealed)
+    code = compress(survey.bins, settings, "lattice")
+    packets = packets_from(code, turning_track(), submap_header())
+    found = reconstruct_packets(
+        dict(enumerate(packets)), ReconstructionSettings(sealed=sealed), 0.0
+    )
+    assert np.isfinite(found.grid.depth_m).sum() > 500
 
 
 @pytest.fixture(scope="module")

@@ -97,6 +97,7 @@ class LeaderCore:
         self._turns = Turns(slots, LEADER, start.time_s)
         start_m = np.array([start.north_m, start.east_m])
         self.graph.add_chain(LEADER, start.time_s, start_m, start_m)
+        self.fleet.own.add(start.time_s, start.north_m, start.east_m, start.yaw_rad)
 
     # what comes in
 

@@ -50,9 +50,9 @@ class Outlook:
     def observe(self, now_s: float) -> Observability | None:
         """Return what the geometry leaves open of the vehicles' newest states; None if unknown."""
         vehicles, estimate = self._fleet.vehicles(), self._estimate
-        chains = [self._fleet.newest_chain(vehicle) for vehicle in vehicles]
         names = [name_of(vehicle) for vehicle in vehicles]
         try:
+            chains = [self._fleet.newest_chain(vehicle) for vehicle in vehicles]
             joint, reckoned = (
                 estimate.newest_covariance(chains, reckoned=alone) for alone in (False, True)
             )

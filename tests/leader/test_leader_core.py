@@ -362,3 +362,15 @@ def test_a_follower_is_heard_before_the_leader_has_navigation() -> None:
         leader.poll(sent_s + 1.0)
     leader.tick(400.0)
     assert len(sheets_of(leader)) == len({decode(frame).header.submap for frame, _ in FRAMES})
+
+
+def test_a_leader_that_never_has_navigation_composes_and_tells_what_it_heard() -> None:
+    leader = leader_of(line(0.0, 0.0))
+    for first_s in range(0, 1400, 20):
+        frame = trajectory(walked(20, 2.0 * first_s), float(first_s))
+        leader.receive_frame(frame, None, first_s + 20.0)
+        leader.tick(first_s + 20.0)
+    assert leader.composed_s > 0.0
+    assert leader.outlook.observe(1400.0) is not None
+    assert leader.trajectory(1).time_s[-1] >= 1380.0
+    assert leader.track(0).time_s.size == 1

@@ -52,13 +52,17 @@ class Chain:
             self.lost[k : k + 2] = [(begin_s, max(end_s, other_s))]
 
     def lost_m2(self, begin_s: float, end_s: float) -> float:
-        """Return the variance, each axis, that lost spans add to the way in an interval.
+        """Return the variance, each axis, that lost spans add to the way in an interval."""
+        return self.lost_by_m2(end_s) - self.lost_by_m2(begin_s)
+
+    def lost_by_m2(self, time_s: float) -> float:
+        """Return the variance, each axis, that lost spans have added to all of the way by a time.
 
         A vehicle mostly goes on as it went: since a span began sigma grows with the time itself,
         not with its root.
         """
-        ends_s = ((b, min(max(begin_s, b), e), min(max(end_s, b), e)) for b, e in self.lost)
-        return LOST_SIGMA_MPS**2 * sum((y - b) ** 2 - (x - b) ** 2 for b, x, y in ends_s)
+        lasted_s = (min(max(time_s, begin_s), end_s) - begin_s for begin_s, end_s in self.lost)
+        return LOST_SIGMA_MPS**2 * sum(s**2 for s in lasted_s)
 
     def key_at(self, time_s: float) -> int | None:
         """Return the key of the node at exactly this time, or None."""

@@ -101,13 +101,22 @@ class Estimate:
             )
         if in_shape:
             return self._anchor_in_shape(chain_id, key, time_s, track)
+        lost_m2 = abs(chain.lost_m2(chain.times_s[nearest], time_s))
         return Anchor(
             key=key,
             parameters=chain.parameters,
             offset_m=track.position_at(time_s) - chain.reckoned_m[nearest],
             time_s=time_s,
             lag_s=lag_s,
+            apart_m2=lost_m2 * np.eye(2),
         )
+
+    def lost_m2(self, chain_id: int, begin_s: float, end_s: float) -> float:
+        """Return the variance, each axis, that lost navigation adds to the way between two times.
+
+        They come in either order.
+        """
+        return abs(self._chains[chain_id].lost_m2(begin_s, end_s))
 
     def trajectory(self, chain_id: int) -> Trajectory:
         """Return the estimate of one chain at all of its nodes."""

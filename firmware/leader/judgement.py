@@ -212,9 +212,14 @@ class Judgement:
             neighbours[0].time_s - closure.origin_anchor.time_s,
             neighbours[1].time_s - closure.target_anchor.time_s,
         )
+        anchors = closure.origin_anchor, closure.target_anchor
+        lost_m2 = sum(
+            graph.lost_m2(sheet.id.chain, anchor.time_s, sheet.time_s)
+            for sheet, anchor in zip(neighbours, anchors, strict=True)
+        )
         shift_m, covariance_m2 = carried(
             shift_m,
-            closure.covariance_m2,
+            closure.covariance_m2 + lost_m2 * np.eye(2),
             ages_s,
             (reference.drift_mps, query.drift_mps),
             matching,
@@ -249,6 +254,7 @@ class _Odometry:
         self._time_s = np.array([time_s for _, time_s, _ in ends])
         self._reckoned_m = np.array([reckoned_m for _, _, reckoned_m in ends])
         self._bias_mps = np.array([graph.trajectory(chain).bias_at(t) for chain, t, _ in ends])
+        self._lost_m2 = np.array([graph.lost_m2(chain, -np.inf, t) for chain, t, _ in ends])
 
     def __call__(self, first: Keys, second: Keys) -> tuple[Array, Array]:
         """Return offsets (P, 2) and covariances (P, 2, 2), NaN between chains."""
@@ -257,6 +263,7 @@ class _Odometry:
         offset_m = self._reckoned_m[second] - self._reckoned_m[first] - bias_mps * later_s[:, None]
         apart_s = np.abs(later_s)
         variance_m2 = self._noise**2 * apart_s + (self._drift_sigma_mps * apart_s) ** 2
+        variance_m2 += np.abs(self._lost_m2[second] - self._lost_m2[first])
         other = self._chain[first] != self._chain[second]
         offset_m[other], variance_m2[other] = np.nan, np.nan
         return offset_m, variance_m2[:, None, None] * np.eye(2)

@@ -23,7 +23,8 @@ class Anchor:
     The offset drifts with the node's bias for lag_s. The lever leads from the position to a place
     that the sonar saw. Both are told in the frame of the vehicle's own compass, and turn with its
     heading bias; the offset, which the log measured, stretches with its scale as well.
-    apart_m2 (2, 2) is the covariance of the offset, where it was estimated once and for all.
+    apart_m2 (2, 2) is the covariance of the offset, where it was estimated once and for all or
+    navigation was lost on the way.
     """
 
     key: int

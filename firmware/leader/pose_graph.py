@@ -196,9 +196,10 @@ class PoseGraph(Estimate):
 
     def add_absolute(self, anchor: Anchor, position_m: Array, covariance_m2: Array) -> int:
         """Enter an absolute position (2,) of an anchor, active, and return its number."""
-        return self._enter(
-            AbsoluteRecord(anchor=anchor, position_m=position_m, covariance_m2=covariance_m2)
+        record = AbsoluteRecord(
+            anchor=anchor, position_m=position_m, covariance_m2=covariance_m2 + anchor.apart_m2
         )
+        return self._enter(record)
 
     def set_active(self, number: int, *, active: bool) -> None:
         """Take a record into the estimate, or out of it, from the next update on."""

@@ -1,12 +1,18 @@
 """Navigation that is away for a minute: what nobody measured is doubted, not believed."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from firmware.belief import Belief
+from firmware.dead_reckoning import LOST_SIGMA_MPS
 from firmware.follower.core import FollowerCore
+from firmware.leader.atlas import SheetId
 from firmware.leader.chains import Chain
 from firmware.leader.core import LeaderCore
+from firmware.leader.judgement import JudgementSettings, _Odometry
 from firmware.soundings import Fix, Odometry, Ping
 from tests.leader.vessels import ANGLES_RAD, SHORT, Convoy, follower_of, leader_of, line, sail
 
@@ -87,6 +93,46 @@ def test_a_fix_while_navigation_is_lost_is_used() -> None:
     sigma_m = np.sqrt(leader.belief().covariance_m2[0, 0])
     assert chi_square(leader.belief()) < 6.0
     assert sigma_m < 120.0
+
+
+def test_a_fix_is_no_surer_of_a_node_than_the_way_there_that_nobody_measured() -> None:
+    leader = leader_of(corner)
+    for quarter in range(1, 4 * 320 + 1):
+        now_s = quarter / 4.0
+        north_m, east_m = corner(now_s)
+        fix = Fix(vehicle=0, north_m=north_m, east_m=east_m, sigma_m=1.0)
+        is_up = now_s == 248.0  # some seconds after a node
+        steer(leader, now_s, "without bottom", fix if is_up else None)
+        leader.tick(now_s)
+    assert leader.status()["fixes_used"] == 1
+    chain = leader.graph._chains[0]
+    node = chain.nearest(240.0)
+    error_m = leader.trajectory(0).position_m[node] - corner(240.0)
+    known_m2 = leader.graph._solver.covariance([chain.keys[node]])[:2, :2]
+    assert error_m @ np.linalg.solve(known_m2, error_m) < 9.0
+
+
+def test_closures_before_and_after_navigation_was_lost_do_not_contradict_each_other() -> None:
+    graph = leader_of(corner).graph
+    ends_s = [(100.0, 150.0), (180.0, 260.0)]
+    closures: list[Any] = [
+        SimpleNamespace(
+            origin=SheetId(vehicle=0, boot_epoch=0, submap=1),
+            target=SheetId(vehicle=0, boot_epoch=0, submap=2),
+            origin_anchor=SimpleNamespace(time_s=begin_s),
+            target_anchor=SimpleNamespace(time_s=end_s),
+            origin_reckoned_m=np.zeros(2),
+            target_reckoned_m=np.zeros(2),
+        )
+        for begin_s, end_s in ends_s
+    ]
+    ways = np.array([1, 2]), np.array([3, 3])  # from 150 and 180 s to 260 s
+    _, before_m2 = _Odometry(closures, graph, JudgementSettings())(*ways)
+    graph.lose(0, 160.0, 240.0)
+    _, doubted_m2 = _Odometry(closures, graph, JudgementSettings())(*ways)
+    added_m2 = doubted_m2 - before_m2
+    assert added_m2[0] == pytest.approx(LOST_SIGMA_MPS**2 * 80.0**2 * np.eye(2))
+    assert added_m2[1] == pytest.approx(LOST_SIGMA_MPS**2 * (80.0**2 - 20.0**2) * np.eye(2))
 
 
 @pytest.mark.parametrize("how", ["away", "without bottom"])

@@ -3,6 +3,7 @@
 import math
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 
 from protocol.modems.dialect_driver import EVENTS_CAP
 from protocol.modems.events import DialectEvent, ModemComplaint
@@ -47,6 +48,7 @@ class Machine:
         self._output = bytearray()
         self._later: tuple[float, Callable[[float], None]] | None = None
         self._last_line = b""
+        self._again: Callable[[float], None] = partial(self._say, b"")
         self._deadline_s, self._tries = math.inf, 0
         self._heard_s = 0.0
 
@@ -113,28 +115,30 @@ class Machine:
         wait = WAITS[self.state]
         self._tries += 1
         if self._tries < wait.tries:
-            self._deadline_s = now_s + wait.seconds
-            self._output += self._last_line
+            self._again(now_s)
         else:
             self._deadline_s = math.inf
             self._fire(wait.then, NOTHING, now_s)
 
     def _say(self, line: bytes, now_s: float) -> None:
         """Say a line now, and wait for its answer as long as the state allows."""
-        self._later, self._last_line = None, line
+        self._later, self._last_line, self._again = None, line, partial(self._say, line)
         self._output += line
         if self.state in WAITS:
             self._deadline_s = now_s + WAITS[self.state].seconds
 
-    def _say_in_window(
-        self, line_at: Callable[[float], bytes], from_s: float, now_s: float
-    ) -> None:
-        """Say a line about the clock early in a second, from then on; the wait starts then."""
-        due_s = self.clock.next_window_s(from_s)
+    def _say_in_window(self, line_at: Callable[[float], bytes], now_s: float) -> None:
+        """Say a line about the clock early in a second; the wait starts then.
+
+        Asked again it is made anew: it is about the second in which it is said.
+        """
+        anew = partial(self._say_in_window, line_at)
+        due_s = self.clock.next_window_s(now_s)
         if now_s >= due_s:
             self._say(line_at(now_s), now_s)
+            self._again = anew
         else:
-            self._do_later(due_s, lambda then_s: self._say_in_window(line_at, then_s, then_s))
+            self._do_later(due_s, anew)
 
     def _do_later(self, due_s: float, act: Callable[[float], None]) -> None:
         """Put an action off; nothing is waited for until then."""

@@ -5,6 +5,7 @@ silence end it. A setting holds when the echo has its key and its value.
 """
 
 from collections import deque
+from functools import partial
 
 from protocol.modems.events import ModemRestarted
 from protocol.modems.micromodem_clock import parse_version
@@ -114,7 +115,7 @@ class Setup(Machine):
         if not self.clock.speaks_new:
             self.clock.is_set = True
             return "done"
-        self._say_in_window(self._clock_query, now_s + 1.0, now_s)
+        self._do_later(now_s + 1.0, partial(self._say_in_window, self._clock_query))
         return None
 
     def check_clock(self, sentence: Sentence, now_s: float) -> str | None:
@@ -159,7 +160,7 @@ class Setup(Machine):
 
     def _set_clock(self, now_s: float, *, speaks_new: bool) -> None:
         self.clock.is_set, self.clock.speaks_new = False, speaks_new
-        self._say_in_window(self.clock.set_line, now_s, now_s)
+        self._say_in_window(self.clock.set_line, now_s)
 
     def _clock_query(self, now_s: float) -> bytes:
         self._asked_s = now_s

@@ -20,6 +20,7 @@ from protocol.modems.events import (
     RangeMeasured,
 )
 from protocol.modems.micromodem import MicroModem
+from protocol.modems.micromodem_clock import parse_utc
 from protocol.modems.micromodem_settings import MicroModemSettings
 from protocol.modems.micromodem_states import TABLE, WAITS, State
 from protocol.packets import Answer, Header, Profile
@@ -133,6 +134,28 @@ def test_a_line_damaged_while_the_clock_is_set_does_not_end_its_checking() -> No
     unit.power_cycle(rig.now_s)
     rig.run_until(rig.now_s + 20.0)
     assert (core.clock.is_set, core.clock.speaks_new) == (True, True)
+
+
+@pytest.mark.parametrize(("quirks", "answer"), [(MM1_QUIRKS, b"$CACLK"), (None, b"$CATMQ")])
+def test_a_line_about_the_clock_that_is_said_again_is_about_its_new_second(
+    quirks: MicroModemQuirks | None, answer: bytes
+) -> None:
+    """The first answer is lost, and the modem has its line twice."""
+    rig = micro_rig(quirks=quirks)
+    unit, core = unit_of(rig, 1), core_of(rig, 1)
+    receive, lost = core.receive_data, 0
+
+    def lose(data: bytes, now_s: float) -> None:
+        nonlocal lost
+        if not lost and answer in data:
+            lost, data = 1, b""
+        receive(data, now_s)
+
+    core.receive_data = lose  # type: ignore[method-assign]
+    unit.power_cycle(rig.now_s)
+    rig.run_until(rig.now_s + 20.0)
+    assert (lost, core.clock.is_set, core.clock.counters["clock_wrong"]) == (1, True, 0)
+    assert unit.clock.read(0.0) == parse_utc(core.settings.utc_at_zero)
 
 
 def test_old_firmware_gets_a_data_cycle_instead() -> None:

@@ -26,16 +26,22 @@ class LogLine:
 
 
 class RawLog:
-    """A tap that writes to an open text file; hand it to `ModemContext(tap=...)`."""
+    """A tap that writes to an open text file; hand it to `ModemContext(tap=...)`.
+
+    Lines that the disk did not take at once are counted in `unwritten`; the modem goes on.
+    """
 
     def __init__(self, file: TextIO) -> None:
-        self._file = file
+        self._file, self.unwritten = file, 0
 
     def __call__(self, direction: str, data: bytes, now_s: float) -> None:
         """Write one line, and have it on disk before the modem's next word."""
         line = {"t": now_s, "way": direction, "hex": data.hex()}
-        self._file.write(json.dumps(line) + "\n")
-        self._file.flush()
+        try:
+            self._file.write(json.dumps(line) + "\n")
+            self._file.flush()
+        except OSError:
+            self.unwritten += 1
 
 
 def read_log(lines: Iterable[str]) -> Iterator[LogLine]:

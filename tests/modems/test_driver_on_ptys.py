@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import time
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -224,6 +225,18 @@ def test_a_raw_log_replays_to_the_same_words_and_events(tmp_path: Path) -> None:
     assert said == recorded
     assert [e.frame for e in events if isinstance(e, FrameHeard)] == heard == [b"hello"]
     assert core.status() == status
+
+
+def test_a_raw_log_on_a_full_disk_costs_no_frame(tmp_path: Path) -> None:
+    log = RawLog(MagicMock(flush=MagicMock(side_effect=OSError("No space left on device"))))
+    with pair("nanomodem", tmp_path, tap=log) as both:
+        both.run(12.0)
+        both.drivers[0].send(b"out", both.now_s)
+        both.drivers[1].send(b"in", both.now_s + 3.0)
+        both.run(8.0)
+        assert (both.frames(0), both.frames(1)) == ([b"in"], [b"out"])
+        assert both.drivers[0].status().queued == 0
+    assert log.unwritten > 0
 
 
 def test_a_raw_log_cut_by_a_crash_or_damaged_is_read_or_named() -> None:

@@ -7,6 +7,7 @@ comes by a clock that was set back, and is new.
 """
 
 import logging
+import math
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -61,7 +62,7 @@ class Recorder:
         """Record navigation; None for what the journal already holds."""
         if self._is_known(odometry.time_s, self.last_odometry_s):
             return None
-        self.last_odometry_s = odometry.time_s
+        self.last_odometry_s = _end_s(odometry.time_s, self.last_odometry_s)
         self.journal.append(Kind.ODOMETRY, from_odometry(odometry))
         return odometry
 
@@ -69,7 +70,7 @@ class Recorder:
         """Record a ping and return it as a replay will see it; None for a known one."""
         if self._is_known(ping.time_s, self._last_ping_s):
             return None
-        self._last_ping_s = ping.time_s
+        self._last_ping_s = _end_s(ping.time_s, self._last_ping_s)
         fan, body = fan_of(ping), from_ping(ping)
         if fan != self._fan:
             self._fan = fan
@@ -173,11 +174,11 @@ class Recorder:
         match kind:
             case Kind.ODOMETRY:
                 odometry = to_odometry(body)
-                self.last_odometry_s = odometry.time_s
+                self.last_odometry_s = _end_s(odometry.time_s, self.last_odometry_s)
                 core.receive_odometry(odometry)
             case Kind.PING:
                 ping = to_ping(body, self._fan or b"")
-                self._last_ping_s = ping.time_s
+                self._last_ping_s = _end_s(ping.time_s, self._last_ping_s)
                 core.receive_ping(ping)
             case Kind.FAN:
                 self._fan = body
@@ -194,3 +195,8 @@ class Recorder:
                 self._polled[1].append(core.poll(now_s))
             case _:
                 other(kind, body)
+
+
+def _end_s(time_s: float, end_s: float) -> float:
+    """Return where a sensor's record ends now: a stamp that is no time leaves its end."""
+    return time_s if math.isfinite(time_s) else end_s

@@ -1,5 +1,6 @@
 """Stores of vehicles whose clocks are set: what comes back with a clock that is behind."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from firmware.follower.journaled import JournaledFollower
 from firmware.follower.settings import FollowerSettings
 from firmware.journal import Journal, JournalSettings, Owner
+from firmware.soundings import Odometry, Ping
 from tests.leader.vessels import QUICK, SHORT, line, sail, slots_of, start
 
 PATH = line(0.0, 60.0)
@@ -76,3 +78,29 @@ def test_a_leap_of_the_clock_puts_no_checkpoint_off_for_as_long(tmp_path: Path) 
     for now_s in (1.0, 36_000.0, *np.arange(2.0, 70.0, 0.25)):
         follower.tick(now_s)
     assert follower.recorder.journal.counters["store_checkpoints"] >= 2
+
+
+@pytest.mark.parametrize("stamp_s", [float("nan"), float("inf")])
+def test_a_stamp_that_is_no_time_is_not_the_end_of_a_store(tmp_path: Path, stamp_s: float) -> None:
+    odometry = Odometry(
+        time_s=9.0, velocity_north_mps=2.0, velocity_east_mps=0.0, yaw_rad=0.0, depth_m=9.0
+    )
+    ping = Ping(
+        time_s=9.0,
+        slant_ranges_m=np.full(3, 40.0),
+        beam_angles_rad=np.array([-0.5, 0.0, 0.5]),
+        roll_rad=0.0,
+        pitch_rad=0.0,
+        yaw_rad=0.0,
+        depth_m=9.0,
+    )
+    first = resumed(tmp_path).recorder
+    for one in (odometry, replace(odometry, time_s=stamp_s)):
+        first.odometry(one)
+    for another in (ping, replace(ping, time_s=stamp_s)):
+        first.ping(another)
+    first.journal.close()
+    again = resumed(tmp_path).recorder
+    assert again.marks()[:3] == first.marks()[:3]
+    assert again.odometry(odometry) is None
+    assert again.ping(ping) is None

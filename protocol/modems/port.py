@@ -1,7 +1,9 @@
 """A serial port that never blocks and may vanish and come back; the bytes are not its business."""
 
 import os
+import termios
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from typing import TypeVar
 
@@ -79,9 +81,8 @@ class SerialPort:
 
     def close(self) -> None:
         """Give the port back for good."""
-        if self._serial is not None:
-            self._serial.close()
-        self._serial, self._is_given_back = None, True
+        self._let_go()
+        self._is_given_back = True
 
     def _open(self) -> serial.Serial:
         port = serial.Serial(timeout=0, exclusive=True, baudrate=self.baud)
@@ -89,7 +90,8 @@ class SerialPort:
         port.rts = self._rts  # before opening: some boxes take RTS for power control
         try:
             port.open()
-        except (serial.SerialException, OSError) as error:
+        except (serial.SerialException, OSError, termios.error) as error:
+            # pyserial lets termios.error, no OSError, out where an adapter goes while it is opened
             raise ModemUnavailable(_advice(self.path, error)) from error
         return port
 
@@ -102,10 +104,17 @@ class SerialPort:
         except (serial.SerialException, OSError, TypeError) as error:
             # pyserial raises TypeError when its descriptor vanished under it
             self.last_error = str(error)
-            self._serial.close()
-            self._serial, self._tried_s = None, now_s
+            self._let_go()
+            self._tried_s = now_s
             self._unsent.clear()
             return None
+
+    def _let_go(self) -> None:
+        """Close the port; one that has gone may refuse even that."""
+        port, self._serial = self._serial, None
+        if port is not None:
+            with suppress(OSError):
+                port.close()
 
 
 def _waiting(port: serial.Serial) -> bytes:

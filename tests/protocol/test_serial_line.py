@@ -1,10 +1,12 @@
 """The raw serial line on ptys: ports that are missing, vanish, come back; foreign traffic."""
 
 import os
+import termios
 import time
 import tty
 from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -162,6 +164,34 @@ def test_a_port_that_vanishes_and_comes_back_loses_nothing_queued(port: Port) ->
     assert port.read_whole(line) == line
     status = modem.status()
     assert (status.is_up, status.reopened, status.sent, status.queued) == (True, 1, 10, 0)
+    modem.close()
+
+
+def test_a_port_that_goes_while_it_is_opened_is_one_that_is_not_there(
+    port: Port, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    modem = open_line(port)
+    port.pull()
+    modem.poll(0.0)
+    port.plug()
+    with monkeypatch.context() as patch:
+        patch.setattr(termios, "tcflush", MagicMock(side_effect=termios.error(5, "I/O error")))
+        with pytest.raises(ModemUnavailable, match="I/O error"):
+            open_line(port)
+        modem.poll(REOPEN_S)
+        assert not modem.status().is_up
+    modem.poll(2 * REOPEN_S)
+    assert modem.status().is_up
+    modem.close()
+
+
+def test_a_port_that_cannot_even_be_closed_comes_back(port: Port) -> None:
+    modem = open_line(port)
+    os.close(modem._port._serial.fileno())  # type: ignore[union-attr]
+    modem.poll(0.0)
+    assert not modem.status().is_up
+    modem.poll(REOPEN_S)
+    assert modem.status().is_up
     modem.close()
 
 

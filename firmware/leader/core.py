@@ -76,7 +76,7 @@ class LeaderCore:
         self._reassembler = Reassembler(reassembly_of(settings, slots))
         self._ranging = RangeWindows(settings.ranges)
         self.fleet = Fleet(self.graph, self._ranging, settings.fleet)
-        self._fixes = Fixes(settings.fixes)
+        self._fixes = Fixes(settings.fixes, slots.settings.followers)
         self._answers = Answers(
             boot_epoch, self.fleet, self.graph, extended=settings.answers == "extended"
         )

@@ -1,8 +1,8 @@
 """Absolute positions: GNSS at the surface, USBL from a ship or about a follower. Judged, then used.
 
-A fix waits until its vehicle's dead reckoning is known at its time. It is gated by the estimate's
-own covariance: an impossible one is counted and dropped, and so is one right after another unless
-it is much surer.
+A fix waits until its vehicle's dead reckoning is known at its time; one right after another is
+dropped at once unless it is much surer. It is gated by the estimate's own covariance: an impossible
+one is dropped, too, and everything dropped is counted.
 """
 
 from collections import Counter, deque
@@ -15,6 +15,7 @@ from firmware.leader.pose_graph import PoseGraph
 from firmware.soundings import Fix
 from protocol.errors import EstimationError
 from protocol.settings import Settings, setting
+from protocol.vehicles import LEADER
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,17 +44,23 @@ class FixSettings(Settings):
 class Fixes:
     """Fixes in by `hold`, factors out by `use`; bounded, everything dropped is counted."""
 
-    def __init__(self, settings: FixSettings) -> None:
+    def __init__(self, settings: FixSettings, followers: int) -> None:
         self.counters: Counter[str] = Counter()
-        self._settings = settings
+        self._settings, self._followers = settings, followers
         self._held: deque[tuple[float, Fix]] = deque(maxlen=settings.held)
-        self._used: dict[int, tuple[float, float]] = {}  # time and sigma of each chain's last
+        self._used: dict[int, tuple[float, Fix]] = {}  # each vehicle's last, and its time
 
     def hold(self, time_s: float, fix: Fix) -> None:
-        """Keep a fix until it can be used."""
+        """Keep a fix that tells something new until it can be used."""
+        if not LEADER <= fix.vehicle <= self._followers:
+            self.counters["fixes_of_unknown_vehicles"] += 1
+            return
         sane = np.isfinite([fix.north_m, fix.east_m]).all()
         if not sane or not 0.0 < fix.sigma_m <= self._settings.sigma_limit_m:
             self.counters["fixes_bad"] += 1
+            return
+        if self._is_alike(time_s, fix):
+            self.counters["fixes_alike"] += 1
             return
         if len(self._held) == self._held.maxlen:
             self.counters["fixes_overwritten"] += 1
@@ -74,11 +81,17 @@ class Fixes:
             except EstimationError:
                 self.counters["fixes_unplaceable"] += 1
 
+    def _is_alike(self, time_s: float, fix: Fix) -> bool:
+        """Return whether a fix is hardly surer than one of its vehicle shortly before or after."""
+        return any(
+            other.vehicle == fix.vehicle
+            and abs(time_s - other_s) < self._settings.apart_s
+            and fix.sigma_m > other.sigma_m / 2.0
+            for other_s, other in (*self._held, *self._used.values())
+        )
+
     def _entered(self, time_s: float, fix: Fix, fleet: Fleet, graph: PoseGraph) -> str:
         chain = fleet.chain_at(fix.vehicle, time_s)
-        last_s, last_sigma_m = self._used.get(chain, (-np.inf, np.inf))
-        if abs(time_s - last_s) < self._settings.apart_s and fix.sigma_m > last_sigma_m / 2.0:
-            return "fixes_alike"
         fleet.extend(chain)
         anchor = graph.anchor(chain, time_s, fleet.track(chain))
         variance_m2 = fix.sigma_m**2 + self._settings.sigma_floor_m**2
@@ -89,5 +102,5 @@ class Fixes:
             return "fixes_rejected"
         graph.add_absolute(anchor, position_m, variance_m2 * np.eye(2))
         graph.update()
-        self._used[chain] = time_s, fix.sigma_m
+        self._used[fix.vehicle] = time_s, fix
         return "fixes_used"

@@ -88,10 +88,25 @@ def test_fix_of_a_follower_waits_for_its_track() -> None:
     assert sea.leader.status()["fixes_used"] == 1
 
 
-def test_fix_of_an_unknown_vehicle_is_given_up() -> None:
-    leader = sailed(60, Fix(vehicle=3, north_m=0.0, east_m=0.0, sigma_m=1.0))
+def test_fix_of_a_vehicle_that_says_nothing_is_given_up() -> None:
+    leader = sailed(60, Fix(vehicle=1, north_m=0.0, east_m=0.0, sigma_m=1.0))
     leader.tick(1200.0)
     assert leader.status()["fixes_too_late"] == 1
+
+
+def test_fix_of_an_unknown_vehicle_is_counted_and_dropped() -> None:
+    leader = sailed(60, Fix(vehicle=2, north_m=0.0, east_m=0.0, sigma_m=1.0))
+    assert leader.status()["fixes_of_unknown_vehicles"] == 1
+
+
+def test_fixes_of_a_follower_leave_room_for_those_of_another() -> None:
+    sea = convoy(2).run(0.0, 30.0)
+    tell(sea.leader, Fix(vehicle=1, north_m=30.5, east_m=60.0, sigma_m=1.0), 30.25)
+    for at_s in np.linspace(32.0, 32.25, 100):
+        fix = Fix(vehicle=2, north_m=-60.0 + 2.0 * at_s, east_m=120.0, sigma_m=1.0)
+        sea.leader.receive_odometry(sample(at_s, fix))
+    status = sea.run(32.25, 100.0).leader.status()
+    assert (status["fixes_used"], status["fixes_alike"]) == (2, 99)
 
 
 def test_odometry_with_a_fix_reads_back_exactly() -> None:

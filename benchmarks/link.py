@@ -142,11 +142,11 @@ def _fragments(vehicle: int, submap: int, count: int, now_s: float) -> list[Subm
 def _next_turn(reassembler: Reassembler, turn: int, followers: int) -> int:
     """Return whom to answer: the next that lacks something, or else the next."""
     order = [(turn + i) % followers + 1 for i in range(followers)]
-    return next((number for number in order if reassembler.missing(number)), order[0])
+    return next((number for number in order if reassembler.missing(number, 0)), order[0])
 
 
 def _answer(reassembler: Reassembler, vehicle: int, number: int, now_s: float) -> ExtendedAnswer:
-    missing = reassembler.missing(vehicle)
+    submap, missing = reassembler.missing(vehicle, 0) or (0, 0)
     return ExtendedAnswer(
         header=Header(
             profile=Profile.ANSWER_EXTENDED,
@@ -165,8 +165,8 @@ def _answer(reassembler: Reassembler, vehicle: int, number: int, now_s: float) -
         leader_north_m=0.0,
         leader_east_m=0.0,
         leader_variance_m2=1.0,
-        repeat_submap=missing[0][2] if missing else 0,
-        missing_fragments=missing[1] if missing else 0,
+        repeat_submap=submap,
+        missing_fragments=missing,
     )
 
 

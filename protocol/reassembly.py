@@ -200,20 +200,20 @@ class Reassembler:
         """Return the oldest event not yet fetched, or None."""
         return self._events.popleft() if self._events else None
 
-    def missing(self, vehicle: int) -> tuple[Key, int] | None:
-        """Return the oldest open transfer of a vehicle and the bitmap of what it still lacks.
+    def missing(self, vehicle: int, boot_epoch: int) -> tuple[int, int] | None:
+        """Return the oldest sub-map of a boot that lacks fragments, and the bitmap of those.
 
         Bit i stands for fragment i. Fragments after the last one heard are not asked for while the
         transfer is the vehicle's newest: they may still be on their way.
         """
         for key, slot in self._slots.items():
-            if key[0] != vehicle:
+            if key[:2] != (vehicle, boot_epoch):
                 continue
             count = slot.first.header.fragment_count
             end = count if slot.overtaken_at_s is not None else max(slot.fragments)
             bitmap = sum(1 << i for i in range(end) if i not in slot.fragments)
             if bitmap:
-                return key, bitmap
+                return key[2], bitmap
         return None
 
     def _open(self, key: Key, packet: Fragment, arrival_s: float) -> _Slot:

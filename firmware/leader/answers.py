@@ -97,7 +97,8 @@ class Answers:
                 east_m=_float32(position_m[1]),
             )
         own = belief()
-        repeat_submap, missing = self._missing(vehicle, known.boot_epoch, reassembler)
+        repeat_submap, missing = reassembler.missing(vehicle, known.boot_epoch) or (0, 0)
+        self.counters["repeats_asked"] += missing.bit_count()
         return ExtendedAnswer(
             header=header,
             submap=known.submap,
@@ -110,14 +111,6 @@ class Answers:
             repeat_submap=repeat_submap,
             missing_fragments=missing,
         )
-
-    def _missing(self, vehicle: int, boot_epoch: int, reassembler: Reassembler) -> tuple[int, int]:
-        """Return the sub-map of this boot that lacks fragments, and the bitmap; zeros for none."""
-        found = reassembler.missing(vehicle)
-        if found is None or found[0][1] != boot_epoch:
-            return 0, 0
-        self.counters["repeats_asked"] += found[1].bit_count()
-        return found[0][2], found[1]
 
 
 def _float32(value: float) -> float:

@@ -135,8 +135,7 @@ class LinkLeader:
         if self._follower_epoch is None:
             return None
         self._answers += 1
-        found = self.reassembler.missing(1)
-        is_ours = found is not None and found[0][1] == self._follower_epoch
+        submap, missing = self.reassembler.missing(1, self._follower_epoch) or (0, 0)
         return ExtendedAnswer(
             header=Header(
                 profile=Profile.ANSWER_EXTENDED,
@@ -155,8 +154,8 @@ class LinkLeader:
             leader_north_m=0.0,
             leader_east_m=0.0,
             leader_variance_m2=1.0,
-            repeat_submap=found[0][2] if found and is_ours else 0,
-            missing_fragments=found[1] if found and is_ours else 0,
+            repeat_submap=submap,
+            missing_fragments=missing,
         )
 
 

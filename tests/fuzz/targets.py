@@ -97,7 +97,7 @@ def reassembly(data: bytes) -> None:
             time_quarters=(c << 12) & 0xFFFFF,
         )
         reassembler.receive(SubmapFragment(header=header, body=bytes(50)), now_s)
-        reassembler.missing(a % 3)
+        reassembler.missing(a % 3, a >> 6)
         assert len(reassembler._slots) <= SMALL.slots
         assert len(reassembler._closed) <= SMALL.remembered
         while (event := reassembler.next_event()) is not None:

@@ -145,7 +145,7 @@ def test_a_lattice_is_handed_on_as_soon_as_others_would_tell_nothing_new() -> No
     assert stream_of(arrived, 0, 10).startswith(stream[:1200])
     assert (reassembler.counters.complete, reassembler.counters.spare) == (1, 1)
     assert reassembler.counters.partial == 0
-    assert reassembler.missing(1) is None
+    assert reassembler.missing(1, 0) is None
 
 
 @given(st.permutations(range(10)))
@@ -242,14 +242,24 @@ def test_a_fragment_that_contradicts_its_transfer_is_dropped_and_counted() -> No
 def test_missing_fragments_are_named_once_later_ones_were_heard() -> None:
     reassembler = Reassembler(SETTINGS)
     sent = submap(6)
-    assert reassembler.missing(1) is None
+    assert reassembler.missing(1, 0) is None
     for i in (0, 1, 4):
         reassembler.receive(sent[i], 4.0 * i)
     reassembler.receive(submap(2, vehicle=2)[0], 17.0)
-    assert reassembler.missing(1) == ((1, 0, 6), 0b1100)
-    assert reassembler.missing(2) is None
+    assert reassembler.missing(1, 0) == (6, 0b1100)
+    assert reassembler.missing(2, 0) is None
     reassembler.receive(submap(7)[0], 40.0)
-    assert reassembler.missing(1) == ((1, 0, 6), 0b1111101100)
+    assert reassembler.missing(1, 0) == (6, 0b1111101100)
+
+
+def test_what_a_dead_boot_left_open_hides_nothing_that_the_new_one_lacks() -> None:
+    reassembler = Reassembler(SETTINGS)
+    for i in (0, 2):
+        reassembler.receive(submap(6)[i], 4.0 * i)
+    for i in (0, 2):
+        reassembler.receive(submap(0, boot_epoch=1, at_s=10)[i], 10.0 + 4.0 * i)
+    assert reassembler.missing(1, 0) == (6, 0b1111111010)
+    assert reassembler.missing(1, 1) == (0, 0b10)
 
 
 def test_events_nobody_fetches_are_bounded_and_counted() -> None:

@@ -15,6 +15,8 @@ from protocol.reassembly import Reassembler
 from protocol.timestamps import to_quarters, to_tx_second
 from protocol.vehicles import LEADER
 
+_SILENT_S = 900.0  # no follower keeps a frame for as long: that it hears answers is a hope
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KnownState:
@@ -27,7 +29,10 @@ class KnownState:
 
 
 class Answers:
-    """One answer a slot; followers take turns, and one that cannot be answered loses its turn."""
+    """One answer a slot; followers take turns, and one that cannot be answered loses its turn.
+
+    Those that have fallen silent come after all others.
+    """
 
     def __init__(self, boot_epoch: int, fleet: Fleet, graph: PoseGraph, *, extended: bool) -> None:
         self.counters: Counter[str] = Counter()
@@ -52,8 +57,8 @@ class Answers:
 
         `belief` tells where the leader is; only an extended answer asks.
         """
-        vehicles = sorted(self._known, key=lambda v: (v <= self._last_vehicle, v))
-        for vehicle in vehicles:
+        silent = {v for v, known in self._known.items() if now_s - known.time_s > _SILENT_S}
+        for vehicle in sorted(self._known, key=lambda v: (v in silent, v <= self._last_vehicle, v)):
             known = self._known[vehicle]
             try:
                 answer = self._answer(vehicle, known, belief, reassembler, now_s)

@@ -77,6 +77,21 @@ def test_four_followers_have_each_a_chain_and_a_turn() -> None:
         assert four.followers[vehicle][0].status()["answers_used"] >= 2
 
 
+def test_followers_that_have_fallen_silent_cost_the_others_no_turn() -> None:
+    leader = leader_of(line(0.0, 0.0), slots=slots_of(2))
+    told = []
+    for quarter in range(1, 4001):
+        now_s = quarter / 4.0
+        sail(leader, line(0.0, 0.0), now_s, sonar_on=False)
+        for vehicle in {21.0: (1, 2), 921.0: (1,)}.get(now_s, ()):
+            states = trajectory(walked(20, 2.0 * now_s), now_s - 21.0, vehicle=vehicle)
+            leader.receive_frame(states, None, now_s)
+        if (frame := leader.poll(now_s)) is not None:
+            told.append((now_s, decode(frame).header.fragment))
+    assert {vehicle for now_s, vehicle in told if now_s < 900.0} == {1, 2}
+    assert {vehicle for now_s, vehicle in told if now_s > 925.0} == {1}
+
+
 def test_fourteen_followers_have_room_and_time_for_their_sub_maps() -> None:
     slots = Slots(SlotSettings(followers=14, follower_slot_s=4))
     sized = reassembly_of(LeaderSettings(), slots)

@@ -61,7 +61,7 @@ class LeaderSettings(Settings):
         maximum=100_000,
     )
     hop_s: float = setting(
-        20.0, "s", "own sub-maps overlap by half: closures come earlier", minimum=4.0
+        20.0, "s", "own sub-maps overlap by half: closures come earlier", minimum=4.0, maximum=40.0
     )
 
 

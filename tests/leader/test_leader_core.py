@@ -11,7 +11,7 @@ from firmware.leader.core import LeaderCore
 from firmware.leader.ledger import OdometryRecord
 from firmware.leader.settings import LeaderSettings, reassembly_of
 from protocol.codec import decode, encode
-from protocol.errors import EstimationError
+from protocol.errors import ConfigError, EstimationError
 from protocol.packets import (
     Answer,
     ExtendedAnswer,
@@ -231,6 +231,11 @@ def test_only_an_answer_that_tells_of_the_leader_asks_where_it_is(
     monkeypatch.setattr(leader, "belief", counted)
     assert leader.poll(111.0) is not None
     assert len(beliefs) == asked
+
+
+def test_hop_longer_than_a_sub_map_may_last_is_refused_under_its_own_name() -> None:
+    with pytest.raises(ConfigError, match="hop_s"):
+        LeaderSettings(hop_s=60.0)
 
 
 def test_composition_that_fails_is_tried_again_an_interval_later(

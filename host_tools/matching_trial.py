@@ -49,7 +49,7 @@ MEETING_M = 60.0
 # The paper's gates alone: the least E below 0.02, N_T, and nothing on what else would fit.
 PAPER_GATES = {
     "residual_noise_ratio": 0.0,
-    "depth_offset_sigma_m": 0.0,
+    "absolute_depth": True,
     "false_mass_limit": 1.0,
     "evidence_limit": 0.0,
     "sigma_limit_m": 1e9,

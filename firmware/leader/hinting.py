@@ -77,7 +77,7 @@ def _depth_misfit(problem: PairProblem, surface: ErrorSurface) -> Array:
     On a slope that goes on, it alone tells how far along they lie. Tide and sensor may have
     wandered: a t-distribution of three degrees of freedom forgives them a few sigmas.
     """
-    told_m = problem.settings.depth_offset_sigma_m
+    told_m = problem.noise.offset_sigma_m
     if told_m == 0.0:
         return np.zeros(surface.overlap_cells.shape)
     variance_m2 = told_m**2 + problem.strained_m2 + _DATUM_FLOOR_M**2
@@ -138,7 +138,7 @@ def _cautious(problem: PairProblem, surface: ErrorSurface, relief: Relief, prior
         noise_scale=scale,
         information_per_cell=problem.information(
             scale,
-            strain_m=problem.settings.strain_sigma_m,
+            strain_m=problem.sigmas.strain_m,
             longest_m=_LONGEST_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(prior.covariance_m2)[-1])),
         ),
         coherent_cells=problem.settings.hint_overlap_m2 / problem.query.grid.cell_m**2,

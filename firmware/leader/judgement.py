@@ -207,7 +207,8 @@ class Judgement:
             side_of(sheet, trajectory)
             for sheet, trajectory in zip(neighbours, trajectories, strict=True)
         )
-        matching = self._calibrations.matching_of(reference, query, shift_m)
+        matching = self._calibrations.matching
+        sigmas = self._calibrations.sigmas_of(reference, query, shift_m)
         ages_s = (
             neighbours[0].time_s - closure.origin_anchor.time_s,
             neighbours[1].time_s - closure.target_anchor.time_s,
@@ -228,6 +229,7 @@ class Judgement:
             reference=self._calibrations.level(reference),
             query=self._calibrations.level(query),
             matching=matching,
+            sigmas=sigmas,
             shift_m=shift_m,
             covariance_m2=covariance_m2,
             reference_reconstructed=neighbours[0].reconstructed,

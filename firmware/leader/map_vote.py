@@ -15,7 +15,7 @@ import numpy as np
 
 from firmware.geometry import Array
 from firmware.leader.ambiguity import Relief
-from firmware.leader.matches import MatchingSettings
+from firmware.leader.matches import ANY_PAIR, MatchingSettings, PairSigmas
 from firmware.leader.pair_problem import PairProblem, pair_problem, relief_of
 from firmware.leader.screening import ErrorSurface
 from firmware.submaps import GriddedSubmap
@@ -49,7 +49,7 @@ class VoteWindow:
 
     shift_m (2,) is what the closure says is to be added to the query's coordinates so that it lies
     on the reference; covariance_m2 (2, 2) is its covariance and that of the dead reckoning in
-    between (`carried`); matching holds the sigmas of this pair.
+    between (`carried`).
     """
 
     reference: GriddedSubmap
@@ -57,6 +57,7 @@ class VoteWindow:
     shift_m: Array
     covariance_m2: Array
     matching: MatchingSettings
+    sigmas: PairSigmas = ANY_PAIR
     reference_reconstructed: bool = False
     query_reconstructed: bool = False
 
@@ -113,6 +114,7 @@ def _ratio(window: VoteWindow, settings: VoteSettings, tolerated: float) -> floa
         window.reference,
         window.query,
         window.matching,
+        window.sigmas,
         reference_reconstructed=window.reference_reconstructed,
         query_reconstructed=window.query_reconstructed,
     )

@@ -13,7 +13,7 @@ from firmware.leader.closure_settings import ClosureSettings
 from firmware.leader.displacement import Look
 from firmware.leader.drifts import NO_DRIFT, Drifts
 from firmware.leader.estimate import Estimate
-from firmware.leader.matches import MatchingSettings, MatchOutcome, NoMatch
+from firmware.leader.matches import MatchingSettings, MatchOutcome, NoMatch, PairSigmas
 from firmware.leader.matching import match
 from firmware.leader.nonconvexity import Doubt
 from firmware.leader.offsets import Offset, anchor_of, corrections, offsets_of
@@ -36,6 +36,7 @@ class MatchJob:
     prior_shift_m: Array
     prior_covariance_m2: Array
     settings: MatchingSettings
+    sigmas: PairSigmas
     looks: tuple[Look, Look]
     drifts: Drifts = NO_DRIFT
     hinted: bool = True
@@ -58,6 +59,7 @@ class MatchJob:
             self.prior_shift_m,
             self.prior_covariance_m2,
             self.settings,
+            self.sigmas,
             reference_reconstructed=self.origin.reconstructed,
             query_reconstructed=self.target.reconstructed,
             drifts=self.drifts,
@@ -248,8 +250,9 @@ def _jobs(
             target_drift_mps=target.drift_mps,
             prior_shift_m=offset.shift_m,
             prior_covariance_m2=offset.covariance_m2,
-            settings=_strained(
-                calibrations.matching_of(origin, target, offset.shift_m), origin, target, offset
+            settings=calibrations.matching,
+            sigmas=_strained(
+                calibrations.sigmas_of(origin, target, offset.shift_m), origin, target, offset
             ),
             drifts=offset.drifts,
             hinted=offset.sigma_m >= settings.hint_prior_m
@@ -260,18 +263,12 @@ def _jobs(
     ]
 
 
-def _strained(
-    settings: MatchingSettings, origin: Side, target: Side, offset: Offset
-) -> MatchingSettings:
-    """Return the settings of a pair with what is not known of its drifts."""
+def _strained(sigmas: PairSigmas, origin: Side, target: Side, offset: Offset) -> PairSigmas:
+    """Return the sigmas of a pair with what is not known of its drifts."""
     known_m2 = offset.covariance_m2
     drift_m2ps2 = offset.drifts.covariance(known_m2)
     expected_m = strain_m(origin, target, drift_m2ps2)
     left_m = strain_m(origin, target, offset.drifts.left)
     strained_m = min(float(np.hypot(left_m, offset.drifts.unresolved_m(known_m2))), expected_m)
     worst_mps = np.sqrt(max(np.trace(drift_m2ps2[:2, :2]), np.trace(drift_m2ps2[2:, 2:])) / 2.0)
-    return dataclasses.replace(
-        settings,
-        strain_sigma_m=strained_m,
-        drift_sigma_mps=float(np.hypot(settings.drift_sigma_mps, worst_mps)),
-    )
+    return dataclasses.replace(sigmas, strain_m=strained_m, drift_mps=float(worst_mps))

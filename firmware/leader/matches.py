@@ -38,14 +38,8 @@ class MatchingSettings(Settings):
     search_cap_m: float = setting(200.0, "m", "beyond it sub-maps do not meet", minimum=1.0)
     candidates: int = setting(200, "", "lattice shifts looked at more closely", minimum=1)
     basins: int = setting(4, "", "separate minima refined below the cell", minimum=1)
-    depth_offset_sigma_m: float = setting(
-        0.3, "m", "tide and datum between passes; 0 is the paper's absolute depth", minimum=0.0
-    )
-    tilt_sigma: float = setting(
-        0.004, "m/m", "roll bias of 0.2 degree seen from both sides", minimum=0.0
-    )
-    bend_sigma_per_m: float = setting(
-        4e-5, "1/m", "a smile of 0.15 m at the edge of a 60 m swath", minimum=0.0
+    absolute_depth: bool = setting(
+        False, "", "the paper's: neither tide nor datum differs between passes"
     )
     calibration: CalibrationSettings = setting(
         CalibrationSettings, "", "swath errors learned from overlaps"
@@ -61,12 +55,6 @@ class MatchingSettings(Settings):
     )
     position_sigma_m: float = setting(
         0.5, "m", "heading noise and wandering inside a sub-map, felt on slopes", minimum=0.0
-    )
-    strain_sigma_m: float = setting(
-        0.0,
-        "m",
-        "between cells of two sub-maps, by drift within them that is not known yet",
-        minimum=0.0,
     )
     finest_wave_m: float = setting(
         17.0, "m", "twice the spacing of 150 pseudo points on a sub-map", minimum=0.1
@@ -105,6 +93,20 @@ class MatchingSettings(Settings):
     slope_smoothing_cells: float = setting(
         0.5, "cells", "keeps sounding noise out of the slopes", minimum=0.1
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairSigmas:
+    """What is not known of one pair of sub-maps, as standard deviations; all may be zero."""
+
+    offset_m: float = 0.3  # tide and datum between the passes
+    tilt: float = 0.004  # m/m; roll bias of 0.2 degree seen from both sides
+    bend_per_m: float = 4e-5  # a smile of 0.15 m at the edge of a 60 m swath
+    strain_m: float = 0.0  # between cells of both, by drift within them that is not known yet
+    drift_mps: float = 0.0  # of either, beside that of the settings
+
+
+ANY_PAIR = PairSigmas()  # of vehicles that nothing is known of
 
 
 class NoMatch(enum.Enum):

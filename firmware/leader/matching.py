@@ -11,7 +11,14 @@ from firmware.leader.ambiguity import Prior
 from firmware.leader.covariance import Refined, measure
 from firmware.leader.drifts import NO_DRIFT, Drifts, screened_by_drift
 from firmware.leader.hinting import hint_of
-from firmware.leader.matches import Match, MatchingSettings, MatchOutcome, NoMatch
+from firmware.leader.matches import (
+    ANY_PAIR,
+    Match,
+    MatchingSettings,
+    MatchOutcome,
+    NoMatch,
+    PairSigmas,
+)
 from firmware.leader.pair_problem import PairProblem, pair_problem, relief_of
 from firmware.leader.refinement import refine
 from firmware.leader.screening import ErrorSurface
@@ -39,6 +46,7 @@ def match(
     prior_shift_m: Array,
     prior_covariance_m2: Array,
     settings: MatchingSettings,
+    sigmas: PairSigmas = ANY_PAIR,
     *,
     reference_reconstructed: bool = False,
     query_reconstructed: bool = False,
@@ -62,6 +70,7 @@ def match(
         reference,
         query,
         settings,
+        sigmas,
         reference_reconstructed=reference_reconstructed,
         query_reconstructed=query_reconstructed,
     )
@@ -241,7 +250,7 @@ def _decide(
         axis = np.array([np.cos(elsewhere.axis_rad), np.sin(elsewhere.axis_rad)])
     else:
         return _none(NoMatch.AMBIGUOUS)
-    turned_rad = settings.strain_sigma_m / winner.field.extent_m
+    turned_rad = problem.sigmas.strain_m / winner.field.extent_m
     line = ambiguity.ridge_of(*ridge, prior, refined.shift_m, axis, turned_rad)
     axis, across = line.axis, np.array([-line.axis[1], line.axis[0]])
     slide_m2 = ambiguity.PRIOR_DOUBTED**2 * float(across @ prior.covariance_m2 @ across)

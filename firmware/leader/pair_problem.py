@@ -8,7 +8,7 @@ import numpy as np
 from firmware.geometry import Array
 from firmware.leader.alignment import NoiseModel
 from firmware.leader.ambiguity import Relief, background
-from firmware.leader.matches import MatchingSettings
+from firmware.leader.matches import ANY_PAIR, MatchingSettings, PairSigmas
 from firmware.leader.relief import (
     Spectrum,
     WaveNoise,
@@ -37,6 +37,7 @@ class PairProblem:
     reference: Layer
     query: Layer
     settings: MatchingSettings
+    sigmas: PairSigmas
     noise: NoiseModel
     minimum_cells: float
     ridge_cells: float
@@ -82,7 +83,7 @@ class PairProblem:
     @property
     def strained_m2(self) -> float:
         """What drift inside the sub-maps does to a cell's depth, which slopes to two sides."""
-        return 2.0 * self.settings.strain_sigma_m**2 * self.slope2
+        return 2.0 * self.sigmas.strain_m**2 * self.slope2
 
     def strained(self, surface: ErrorSurface) -> ErrorSurface:
         """Return a surface of which noise also explains what drift inside the sub-maps does."""
@@ -108,6 +109,7 @@ def pair_problem(
     reference: GriddedSubmap,
     query: GriddedSubmap,
     settings: MatchingSettings,
+    sigmas: PairSigmas = ANY_PAIR,
     *,
     reference_reconstructed: bool,
     query_reconstructed: bool,
@@ -143,12 +145,14 @@ def pair_problem(
     noise_m2 = sum(_per_cell(layer.noise_m2, layer) for layer in layers)
     rebuilt_m2 = sum(_per_cell(layer.map_m2, layer) for layer in layers if layer.reconstructed)
     shared_m2 = settings.correlated_share * rebuilt_m2
-    offset_m2 = settings.depth_offset_sigma_m**2
+    noise = noise_model(settings, shared_m2 / noise_m2, sigmas)
+    offset_m2 = noise.offset_sigma_m**2
     return PairProblem(
         reference=layers[0],
         query=layers[1],
         settings=settings,
-        noise=noise_model(settings, shared_m2 / noise_m2),
+        sigmas=sigmas,
+        noise=noise,
         minimum_cells=settings.minimum_overlap_m2 / query.cell_m**2,
         ridge_cells=noise_m2 / offset_m2 if offset_m2 > 0.0 else np.inf,
         spectra=spectra,
@@ -175,15 +179,17 @@ def _per_cell(values: Array, layer: Layer) -> float:
     return float(values.sum() / layer.known.sum())
 
 
-def noise_model(settings: MatchingSettings, correlated_share: float) -> NoiseModel:
+def noise_model(
+    settings: MatchingSettings, correlated_share: float, sigmas: PairSigmas = ANY_PAIR
+) -> NoiseModel:
     """Return the standard deviations that a fit assumes."""
     return NoiseModel(
         cell_sigma_m=settings.cell_sigma_m,
         position_sigma_m=settings.position_sigma_m,
-        offset_sigma_m=settings.depth_offset_sigma_m,
-        tilt_sigma=settings.tilt_sigma,
-        bend_sigma_per_m=settings.bend_sigma_per_m,
-        drift_sigma_mps=settings.drift_sigma_mps,
+        offset_sigma_m=0.0 if settings.absolute_depth else sigmas.offset_m,
+        tilt_sigma=sigmas.tilt,
+        bend_sigma_per_m=sigmas.bend_per_m,
+        drift_sigma_mps=float(np.hypot(settings.drift_sigma_mps, sigmas.drift_mps)),
         walk_m2_per_s=settings.walk_m2_per_s,
         correlation_m=settings.correlation_m,
         correlated_share=correlated_share,

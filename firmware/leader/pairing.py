@@ -4,7 +4,6 @@ What calibration does not know yet of the pair's swath errors, and how far tide 
 may have wandered between the passes, goes into the match as prior sigmas.
 """
 
-import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +14,7 @@ from firmware.leader.atlas import Sheet
 from firmware.leader.calibration import Calibration, Overlap
 from firmware.leader.displacement import Look
 from firmware.leader.drifts import AGE_S
-from firmware.leader.matches import MatchingSettings
+from firmware.leader.matches import MatchingSettings, PairSigmas
 from firmware.leader.pair_problem import noise_model
 from firmware.leader.swath import Swath, levelled, swath_of
 from firmware.leader.trajectory import Trajectory
@@ -68,7 +67,7 @@ class Calibrations:
     """The calibration of every vehicle, and what it makes of pairs."""
 
     def __init__(self, matching: MatchingSettings) -> None:
-        self._settings, self._matching = matching.calibration, matching
+        self._settings, self.matching = matching.calibration, matching
         self._noise: NoiseModel = noise_model(matching, 0.0)
         self._vehicles: dict[int, Calibration] = {}
 
@@ -115,15 +114,11 @@ class Calibrations:
             covariance=calibration.covariance,
         )
 
-    def matching_of(self, origin: Side, target: Side, shift_m: Array) -> MatchingSettings:
-        """Return the settings of a match with the sigmas that remain for this pair."""
+    def sigmas_of(self, origin: Side, target: Side, shift_m: Array) -> PairSigmas:
+        """Return what is left of the swath errors of a pair, and how far depths may differ."""
         tilt, bend = self._remaining(origin, target, shift_m)
-        return dataclasses.replace(
-            self._matching,
-            depth_offset_sigma_m=self._wander_m(origin, target),
-            tilt_sigma=tilt,
-            bend_sigma_per_m=bend,
-        )
+        offset_m = self._wander_m(origin, target)
+        return PairSigmas(offset_m=offset_m, tilt=tilt, bend_per_m=bend)
 
     def _known(self, vehicle: int) -> bool:
         calibration, s = self.of(vehicle), self._settings
@@ -132,8 +127,6 @@ class Calibrations:
 
     def _wander_m(self, origin: Side, target: Side) -> float:
         s = self._settings
-        if self._matching.depth_offset_sigma_m == 0.0:
-            return 0.0
         share = 1.0
         if origin.sheet.id.vehicle == target.sheet.id.vehicle:
             apart_s = abs(target.sheet.time_s - origin.sheet.time_s)

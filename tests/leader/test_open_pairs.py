@@ -16,7 +16,7 @@ from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.judgement import Judgement, JudgementSettings
 from firmware.leader.loop_closing import LoopClosing
 from firmware.leader.match_jobs import MatchJob, jobs_again
-from firmware.leader.matches import Hint, Match, MatchingSettings, MatchOutcome, NoMatch
+from firmware.leader.matches import ANY_PAIR, Hint, Match, MatchingSettings, MatchOutcome, NoMatch
 from firmware.leader.offsets import offsets_of
 from firmware.leader.open_pairs import OpenPairs
 from firmware.leader.pairing import Calibrations
@@ -67,6 +67,7 @@ def _job(origin: Sheet, target: Sheet, radius_m: float) -> MatchJob:
         prior_shift_m=np.zeros(2),
         prior_covariance_m2=np.diag([radius_m, radius_m]) ** 2,
         settings=MatchingSettings(),
+        sigmas=ANY_PAIR,
         looks=(LOOK, LOOK),
     )
 
@@ -169,6 +170,12 @@ def test_only_a_much_better_known_offset_is_worth_a_second_look(graph: PoseGraph
     limit_m = job.prior_radius_m / ClosureSettings().second_look_share
     assert len(_looks(graph, 1.01 * limit_m)) == 1
     assert _looks(graph, 0.99 * limit_m) == []
+
+
+def test_what_is_not_known_of_a_pair_changes_no_setting(graph: PoseGraph) -> None:
+    (job,) = _looks(graph, 1e6)
+    assert job.settings == MatchingSettings()
+    assert job.sigmas != ANY_PAIR
 
 
 def test_what_the_pair_itself_has_told_does_not_make_it_better_known(graph: PoseGraph) -> None:

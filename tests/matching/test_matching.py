@@ -5,13 +5,14 @@ import pytest
 from scipy import ndimage
 
 from firmware.geometry import Array
-from firmware.leader.matches import Match, MatchingSettings, NoMatch
+from firmware.leader.matches import ANY_PAIR, Match, MatchingSettings, NoMatch, PairSigmas
 from firmware.leader.matching import match
 from firmware.submaps import GriddedSubmap
 from protocol.errors import EstimationError
 from tests.matching.scenes import Scene
 
 STILL = MatchingSettings(walk_m2_per_s=0.0, drift_sigma_mps=0.0, position_sigma_m=0.1)
+LEVEL = PairSigmas(tilt=0.0, bend_per_m=0.0)
 
 
 def matched(
@@ -20,8 +21,9 @@ def matched(
     prior_m: Array,
     sigma_m: float,
     settings: MatchingSettings = STILL,
+    sigmas: PairSigmas = ANY_PAIR,
 ) -> Match:
-    outcome = match(reference, query, prior_m, np.eye(2) * sigma_m**2, settings)
+    outcome = match(reference, query, prior_m, np.eye(2) * sigma_m**2, settings, sigmas)
     assert outcome.match is not None, outcome.reason
     return outcome.match
 
@@ -31,8 +33,9 @@ def refused(
     query: GriddedSubmap,
     sigma_m: float,
     settings: MatchingSettings = STILL,
+    sigmas: PairSigmas = ANY_PAIR,
 ) -> NoMatch:
-    outcome = match(reference, query, np.zeros(2), np.eye(2) * sigma_m**2, settings)
+    outcome = match(reference, query, np.zeros(2), np.eye(2) * sigma_m**2, settings, sigmas)
     assert outcome.reason is not None
     return outcome.reason
 
@@ -71,22 +74,19 @@ def test_depth_offset_is_a_nuisance_unless_switched_off(scene: Scene) -> None:
     query = scene.submap(200, 220, (41, 70), offset_m=0.4)
     found = matched(reference, query, np.zeros(2), 10.0)
     assert np.abs(found.shift_m).max() < 0.4
-    absolute = dataclasses.replace(STILL, depth_offset_sigma_m=0.0, tilt_sigma=0.0)
-    absolute = dataclasses.replace(absolute, bend_sigma_per_m=0.0)
-    assert refused(reference, query, 10.0, absolute) is not None
+    absolute = dataclasses.replace(STILL, absolute_depth=True)
+    assert refused(reference, query, 10.0, absolute, LEVEL) is not None
 
 
 def test_errors_are_those_that_the_covariance_announces() -> None:
-    plain = dataclasses.replace(
-        STILL, tilt_sigma=0.0, bend_sigma_per_m=0.0, depth_offset_sigma_m=0.0, cell_sigma_m=0.001
-    )
+    plain = dataclasses.replace(STILL, absolute_depth=True, cell_sigma_m=0.001)
     nees = []
     for seed in range(40):
         scene = Scene(seed, rms_m=0.3)
         reference = scene.submap(200, 100, (41, 70))
         truth = scene.rng.uniform(-6.0, 6.0, 2)
         query = scene.submap(210, 200, (41, 70), shift_m=(truth[0], truth[1]))
-        found = matched(reference, query, np.zeros(2), 6.0, plain)
+        found = matched(reference, query, np.zeros(2), 6.0, plain, LEVEL)
         error = found.shift_m - truth
         nees.append(float(error @ np.linalg.solve(found.covariance_m2, error)))
     assert 1.2 < np.mean(nees) < 3.0

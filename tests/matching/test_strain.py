@@ -1,7 +1,5 @@
 """Drift that is not known yet strains sub-maps: pairs are told by how much, and so are hints."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -10,7 +8,7 @@ from firmware.geometry import Array
 from firmware.leader.ambiguity import Prior, ridge_of
 from firmware.leader.atlas import SheetId, sheet_of
 from firmware.leader.drifts import AGE_S
-from firmware.leader.matches import MatchingSettings
+from firmware.leader.matches import MatchingSettings, PairSigmas
 from firmware.leader.matching import match
 from firmware.leader.pair_problem import pair_problem
 from firmware.leader.pairing import Side, side_of, strain_m
@@ -65,13 +63,13 @@ def test_one_unknown_drift_strains_lines_of_opposite_heading_most(
     assert apart_m == pytest.approx(DRIFT_MPS * apart_s, abs=1e-6)
 
 
-def _hints(scenes: list[Scene], prior_m: float, strain_sigma_m: float = 0.0) -> int:
+def _hints(scenes: list[Scene], prior_m: float, strain_m: float = 0.0) -> int:
     """Return how many scenes leave a hint of the shift between two sub-maps."""
-    settings = replace(STILL, strain_sigma_m=strain_sigma_m)
+    sigmas, prior_m2 = PairSigmas(strain_m=strain_m), prior_m**2 * np.eye(2)
     hints = 0
     for scene in scenes:
         sides = [scene.submap(200, east_m, (31, 60)) for east_m in (100, 160)]
-        found = match(sides[0], sides[1], np.zeros(2), prior_m**2 * np.eye(2), settings)
+        found = match(sides[0], sides[1], np.zeros(2), prior_m2, STILL, sigmas)
         hints += found.hint is not None
     return hints
 
@@ -93,7 +91,8 @@ def test_strain_blurs_a_slope_both_ways() -> None:
     problem = pair_problem(
         plane,
         plane,
-        replace(STILL, strain_sigma_m=3.0),
+        STILL,
+        PairSigmas(strain_m=3.0),
         reference_reconstructed=False,
         query_reconstructed=False,
     )
@@ -106,7 +105,7 @@ def test_strain_blurs_a_slope_both_ways() -> None:
 def test_what_strain_may_have_done_is_no_evidence() -> None:
     scenes = [Scene(seed, rms_m=0.035) for seed in range(10)]
     assert _hints(scenes, prior_m=20.0) > 0
-    assert _hints(scenes, prior_m=20.0, strain_sigma_m=30.0) == 0
+    assert _hints(scenes, prior_m=20.0, strain_m=30.0) == 0
 
 
 def _ridge(off_m: Array) -> ErrorSurface:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import rasterio
+from rasterio.io import MemoryFile
 from rasterio.windows import Window as RasterWindow
 from scipy.spatial.transform import Rotation
 
@@ -74,10 +74,8 @@ def forget_mission(folder: Path, terrain: Path | None) -> None:
 
 
 def write_outputs(result: MissionResult, evaluation: Evaluation, folder: Path) -> None:
-    """Write every file of the contract but report.html."""
+    """Write every file of the contract but report.html; summary.json once the others are whole."""
     prepare_folder(folder)
-    summary = json.dumps(summarise(result, evaluation), indent=2)
-    (folder / "summary.json").write_text(summary + "\n", encoding="utf-8")
     for vehicle in result.vehicles:
         write_trajectories(vehicle, result.site.datum, folder)
     write_closures(evaluation.closures, folder / "closures.csv")
@@ -85,6 +83,8 @@ def write_outputs(result: MissionResult, evaluation: Evaluation, folder: Path) -
     site = result.site
     write_map(folder / "map.tif", site, evaluation.map_depth_m, evaluation.map_sigma_m)
     write_map(folder / "map_truth.tif", site, evaluation.truth_depth_m, evaluation.truth_sigma_m)
+    summary = json.dumps(summarise(result, evaluation), indent=2)
+    (folder / "summary.json").write_text(summary + "\n", encoding="utf-8")
 
 
 def write_trajectories(vehicle: VehicleResult, datum: Datum, folder: Path) -> None:
@@ -174,7 +174,10 @@ def write_air(deliveries: Sequence[Delivery], path: Path) -> None:
 
 
 def write_map(path: Path, site: Site, depth_m: Array, sigma_m: Array) -> None:
-    """Write a map on the terrain's whole grid and in its datum: elevation and its deviation."""
+    """Write a map on the terrain's whole grid and in its datum: elevation and its deviation.
+
+    GDAL writes to memory, and Python to the disk: GDAL does not tell of a disk that is full.
+    """
     raster, window = site.raster, site.window
     elevation_m = site.datum.depth_shift_m - depth_m
     profile = {
@@ -190,11 +193,13 @@ def write_map(path: Path, site: Site, depth_m: Array, sigma_m: Array) -> None:
         "tiled": True,
     }
     at = RasterWindow(window.left_column, window.top_row, window.columns, window.rows)
-    with rasterio.open(path, "w", **profile) as dataset:
-        for band, name, layer in ((1, "elevation", elevation_m), (2, "deviation", sigma_m)):
-            filled = np.nan_to_num(layer[::-1], nan=NODATA).astype(np.float32)
-            dataset.write(filled, band, window=at)  # blocks never written hold no data
-            dataset.set_band_description(band, f"{name}_m")
+    with MemoryFile() as memory:
+        with memory.open(**profile) as dataset:
+            for band, name, layer in ((1, "elevation", elevation_m), (2, "deviation", sigma_m)):
+                filled = np.nan_to_num(layer[::-1], nan=NODATA).astype(np.float32)
+                dataset.write(filled, band, window=at)  # blocks never written hold no data
+                dataset.set_band_description(band, f"{name}_m")
+        path.write_bytes(memory.getbuffer())
 
 
 def summarise(result: MissionResult, evaluation: Evaluation) -> dict[str, object]:

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import json
 import re
+import resource
 import tracemalloc
 from pathlib import Path
 
@@ -216,6 +217,24 @@ def test_map_takes_memory_by_the_survey_not_by_the_terrain(
     with rasterio.open(tmp_path / "map.tif") as dataset:
         assert dataset.shape == (8000, 8000)
         assert dataset.read(1, masked=True).count() == depth_m.size
+
+
+def test_a_full_disk_is_an_error_and_leaves_no_summary(
+    mission: MissionResult, tmp_path: Path
+) -> None:
+    evaluation = evaluate(mission)
+    write_outputs(mission, evaluation, tmp_path)
+    sizes = {path.name: path.stat().st_size for path in tmp_path.iterdir()}
+    assert max(sizes, key=lambda name: sizes[name]) == "map.tif"
+    (tmp_path / "summary.json").unlink()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (sizes["map.tif"] - 1, limits[1]))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            write_outputs(mission, evaluation, tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not (tmp_path / "summary.json").exists()
 
 
 def test_report_is_one_file_that_needs_no_other(mission: MissionResult, tmp_path: Path) -> None:

@@ -54,19 +54,24 @@ def prepare_folder(folder: Path) -> Path:
 
 
 def forget_mission(folder: Path, terrain: Path | None) -> None:
-    """Remove what an earlier mission left, by the names of the contract, but no terrain of now.
+    """Remove what an earlier mission left, by the names of the contract.
 
     Raises
     ------
     ConfigError
-        When it cannot be removed.
+        When it cannot be removed, or the terrain has one of these names; then all stays.
     """
-    names = [f"{name_of(vehicle)}_{track}.tum" for vehicle in range(VEHICLES) for track in TRACKS]
-    kept = None if terrain is None else terrain.resolve()
+    tracks = [f"{name_of(vehicle)}_{track}.tum" for vehicle in range(VEHICLES) for track in TRACKS]
+    names = (*FILES, *tracks)
+    for name in names:
+        if terrain is not None and terrain.resolve() == (folder / name).resolve():
+            raise ConfigError(
+                f"--terrain {terrain} would be overwritten by this mission's {name}; "
+                "give another --out"
+            )
     try:
-        for path in (folder / name for name in (*FILES, *names)):
-            if path.resolve() != kept:
-                path.unlink(missing_ok=True)
+        for name in names:
+            (folder / name).unlink(missing_ok=True)
         for vehicle in range(VEHICLES):
             VehicleFiles(folder, vehicle).forget()
     except OSError as error:

@@ -250,15 +250,27 @@ def test_report_is_one_file_that_needs_no_other(mission: MissionResult, tmp_path
 def test_an_earlier_mission_is_removed_by_name_and_nothing_else(tmp_path: Path) -> None:
     (tmp_path / "processes").mkdir()
     left = ("report.html", "follower_2_live.tum", "processes/leader.log", "processes/leader.json")
-    others = ("map.tif", "notes.txt", "follower_2.sqlite", "live.tum", "processes/notes.txt")
+    others = ("notes.txt", "follower_2.sqlite", "live.tum", "processes/notes.txt")
     for name in (*left, *others):
         (tmp_path / name).write_text("")
-    forget_mission(tmp_path, terrain=tmp_path / "processes" / ".." / "map.tif")
+    forget_mission(tmp_path, terrain=tmp_path / "notes.txt")
     assert not any((tmp_path / name).exists() for name in left)
     assert all((tmp_path / name).exists() for name in others)
     (tmp_path / "report.html").mkdir()
     with pytest.raises(ConfigError, match="cannot write to --out"):
         forget_mission(tmp_path, None)
+
+
+def test_a_terrain_that_the_mission_would_overwrite_is_refused_and_all_stays(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "processes").mkdir()
+    for name in ("report.html", "map.tif"):
+        (tmp_path / name).write_text("")
+    with pytest.raises(ConfigError, match=r"by this mission's map.tif; give another --out"):
+        forget_mission(tmp_path, terrain=tmp_path / "processes" / ".." / "map.tif")
+    assert (tmp_path / "report.html").exists()
+    assert (tmp_path / "map.tif").exists()
 
 
 def test_frames_are_counted_once_and_losses_at_each_receiver() -> None:

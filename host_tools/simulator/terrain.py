@@ -1,5 +1,6 @@
 """Terrain files: opened with rasterio, or a built-in seeded relief."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +25,9 @@ LEAST_OTHER_SIGN_SHARE = 0.1
 """Of a grid that is mostly above zero: with more below it, it may be sea beside higher land."""
 FILLS = (-9999, 9999, -32768, -32767, 32767, -99999, 99999, -999999)
 """Stored where nothing was measured: believed of files that declare no such value themselves."""
+METRES = ("m", "metre", "metres", "meter", "meters")
+VERTICAL_UNIT = re.compile(r'VERT_?CR?S\[.*?UNIT\["(.+?)",([\d.eE+-]+)', re.DOTALL)
+"""Name and metres of the unit of heights in the text of a compound system."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,8 +82,8 @@ def open_terrain(path: Path | None, relief_seed: int = 1) -> Raster:
     Raises
     ------
     ConfigError
-        When the file is not a raster, has no projected system in metres, or holds no data; when
-        it may hold depths as well as elevations of more land than sea.
+        When the file is not a raster, has no projected system in metres, holds no data or heights
+        in another unit; when it may hold depths as well as elevations of more land than sea.
     """
     if path is None:
         return _built_in(relief_seed)
@@ -87,7 +91,8 @@ def open_terrain(path: Path | None, relief_seed: int = 1) -> Raster:
         raise ConfigError(f"terrain {path} is not a file; give a GeoTIFF, a BAG or another raster")
     try:
         with rasterio.open(path) as dataset:
-            _check_reference(path, dataset.crs, dataset.transform, dataset.count)
+            _check_reference(path, dataset)
+            _check_heights(path, dataset)
             step = max(1, int(np.ceil(np.sqrt(dataset.width * dataset.height / COARSE_CELLS))))
             shape = (max(1, dataset.height // step), max(1, dataset.width // step))
             stored = dataset.read(1, masked=True, out_shape=shape)
@@ -112,9 +117,10 @@ def open_terrain(path: Path | None, relief_seed: int = 1) -> Raster:
         raise ConfigError(f"terrain {path} cannot be read as a raster: {error}") from error
 
 
-def _check_reference(path: Path, crs: CRS | None, transform: Affine, bands: int) -> None:
+def _check_reference(path: Path, dataset: DatasetReader) -> None:
+    crs, transform = dataset.crs, dataset.transform
     wanted = "reproject it to a metric projection such as UTM (gdalwarp -t_srs EPSG:326xx)"
-    if bands < 1:
+    if dataset.count < 1:
         raise ConfigError(f"terrain {path} has no raster band")
     if crs is None:
         raise ConfigError(f"terrain {path} has no coordinate reference system; {wanted}")
@@ -124,6 +130,19 @@ def _check_reference(path: Path, crs: CRS | None, transform: Affine, bands: int)
         raise ConfigError(f"terrain {path} is in {crs.linear_units}, not in metres; {wanted}")
     if transform.b or transform.d or transform.a <= 0 or transform.e >= 0:
         raise ConfigError(f"terrain {path} is not a north-up grid; rotate it with gdalwarp")
+
+
+def _check_heights(path: Path, dataset: DatasetReader) -> None:
+    told = "tell how many metres one is (gdal_edit.py -units m -scale 0.3048, if feet)"
+    vertical = VERTICAL_UNIT.search(dataset.crs.to_wkt())
+    if vertical and abs(float(vertical[2]) - 1.0) > 1e-9:
+        raise ConfigError(
+            f"terrain {path} is in a system with heights in {vertical[1]}, not in metres; "
+            f"{told} and name its horizontal system alone (-a_srs EPSG:326xx)"
+        )
+    unit = dataset.units[0]
+    if unit and unit.strip().lower() not in METRES:
+        raise ConfigError(f"terrain {path} holds heights in {unit}, not in metres; {told}")
 
 
 def _values(dataset: DatasetReader, stored: np.ma.MaskedArray) -> NDArray[np.float64]:

@@ -185,6 +185,32 @@ def test_terrain_in_feet_is_a_clear_error(tmp_path: Path) -> None:
         open_terrain(path)
 
 
+@pytest.mark.parametrize("unit", ["ft", "cm", "US survey foot"])
+def test_heights_in_another_unit_are_a_clear_error_until_their_scale_is_told(
+    tmp_path: Path, unit: str
+) -> None:
+    path = write_raster(tmp_path / "a.tif", slope())
+    with rasterio.open(path, "r+") as dataset:
+        dataset.units = (unit,)
+    with pytest.raises(ConfigError, match=f"holds heights in {unit}, not in metres; tell how"):
+        open_terrain(path)
+    with rasterio.open(path, "r+") as dataset:
+        dataset.units, dataset.scales = ("Metre",), (0.3048,)
+    np.testing.assert_allclose(open_terrain(path).coarse_m, 0.3048 * slope(), rtol=1e-6)
+
+
+def test_a_vertical_system_in_feet_is_a_clear_error_whatever_the_band_says(tmp_path: Path) -> None:
+    path = write_raster(tmp_path / "a.tif", slope(), crs="EPSG:32619+6360")
+    for unit in (None, "m"):
+        if unit:
+            with rasterio.open(path, "r+") as dataset:
+                dataset.units = (unit,)
+        with pytest.raises(ConfigError, match="a system with heights in US survey foot, not in"):
+            open_terrain(path)
+    metres = write_raster(tmp_path / "b.tif", slope(), crs="EPSG:32619+5703")
+    assert open_terrain(metres).remarks == ()
+
+
 def test_terrain_of_no_data_is_a_clear_error(tmp_path: Path) -> None:
     path = write_raster(tmp_path / "a.tif", np.full((200, 200), -9999.0))
     with pytest.raises(ConfigError, match="every cell is no-data"):

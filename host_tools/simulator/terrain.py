@@ -101,7 +101,7 @@ def open_terrain(path: Path | None, relief_seed: int = 1) -> Raster:
             elevation_m = _elevations(values, positive_down)
             known = np.isfinite(elevation_m)
             if not known.any():
-                raise ConfigError(f"terrain {path} holds no data: every cell is no-data")
+                raise ConfigError(f"terrain {path} {_why_nothing(values)}")
             return Raster(
                 name=path.name,
                 path=path,
@@ -171,6 +171,17 @@ def _holds_depths(path: Path, values: NDArray[np.float64]) -> bool:
             "elevations of more land than sea? declare the land as no-data, or cut it off"
         )
     return True
+
+
+def _why_nothing(values: NDArray[np.float64]) -> str:
+    """Return why none of the values is known: nothing is there, or no seabed."""
+    held = values[np.isfinite(values)]
+    if held.size == 0:
+        return "holds no data: every cell is no-data"
+    return (
+        f"holds values from {held.min():g} to {held.max():g}, none of which a seabed has "
+        f"({-DEEPEST_M:g} to {-HIGHEST_M:g} m); are they in metres?"
+    )
 
 
 def _remarks(

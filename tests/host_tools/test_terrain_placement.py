@@ -217,6 +217,13 @@ def test_terrain_of_no_data_is_a_clear_error(tmp_path: Path) -> None:
         open_terrain(path)
 
 
+def test_heights_in_millimetres_are_told_by_their_values(tmp_path: Path) -> None:
+    path = write_raster(tmp_path / "mm.tif", 1000.0 * slope(), dtype="int32", nodata=None)
+    said = r"holds values from -31960 to -20000, none .* \(-12000 to 100 m\); are they in metres"
+    with pytest.raises(ConfigError, match=said):
+        open_terrain(path)
+
+
 def test_terrain_too_small_names_both_sizes(tmp_path: Path) -> None:
     path = write_raster(tmp_path / "a.tif", slope(60, 60))
     with pytest.raises(ConfigError, match=r"300 x 300 m .* needs 700 x 700 m"):

@@ -9,6 +9,7 @@ import rasterio
 from affine import Affine
 from numpy.typing import NDArray
 from rasterio.crs import CRS
+from rasterio.enums import ColorInterp
 from rasterio.errors import RasterioError
 from rasterio.io import DatasetReader
 from rasterio.windows import Window
@@ -25,6 +26,7 @@ LEAST_OTHER_SIGN_SHARE = 0.1
 """Of a grid that is mostly above zero: with more below it, it may be sea beside higher land."""
 FILLS = (-9999, 9999, -32768, -32767, 32767, -99999, 99999, -999999)
 """Stored where nothing was measured: believed of files that declare no such value themselves."""
+COLOURS = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.palette)
 METRES = ("m", "metre", "metres", "meter", "meters")
 VERTICAL_UNIT = re.compile(r'VERT_?CR?S\[.*?UNIT\["(.+?)",([\d.eE+-]+)', re.DOTALL)
 """Name and metres of the unit of heights in the text of a compound system."""
@@ -82,8 +84,9 @@ def open_terrain(path: Path | None, relief_seed: int = 1) -> Raster:
     Raises
     ------
     ConfigError
-        When the file is not a raster, has no projected system in metres, holds no data or heights
-        in another unit; when it may hold depths as well as elevations of more land than sea.
+        When the file is not a raster, has no projected system in metres, or holds no data, or
+        what is no heights in metres; when it may hold depths as well as elevations of more land
+        than sea.
     """
     if path is None:
         return _built_in(relief_seed)
@@ -133,6 +136,10 @@ def _check_reference(path: Path, dataset: DatasetReader) -> None:
 
 
 def _check_heights(path: Path, dataset: DatasetReader) -> None:
+    if dataset.colorinterp[0] in COLOURS:
+        raise ConfigError(f"terrain {path} is a colour image; give the heights it was drawn from")
+    if dataset.dtypes[0].startswith("complex"):
+        raise ConfigError(f"terrain {path} holds complex numbers; give heights")
     told = "tell how many metres one is (gdal_edit.py -units m -scale 0.3048, if feet)"
     vertical = VERTICAL_UNIT.search(dataset.crs.to_wkt())
     if vertical and abs(float(vertical[2]) - 1.0) > 1e-9:

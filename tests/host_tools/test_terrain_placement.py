@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import rasterio
 from affine import Affine
+from rasterio.enums import ColorInterp
 
 from host_tools.scenario import named_scenario
 from host_tools.simulator.placement import place_survey
@@ -209,6 +210,21 @@ def test_a_vertical_system_in_feet_is_a_clear_error_whatever_the_band_says(tmp_p
             open_terrain(path)
     metres = write_raster(tmp_path / "b.tif", slope(), crs="EPSG:32619+5703")
     assert open_terrain(metres).remarks == ()
+
+
+@pytest.mark.parametrize("colour", [ColorInterp.red, ColorInterp.palette])
+def test_a_colour_image_is_a_clear_error(tmp_path: Path, colour: ColorInterp) -> None:
+    path = write_raster(tmp_path / "a.tif", -slope(), dtype="uint8", nodata=None)
+    with rasterio.open(path, "r+") as dataset:
+        dataset.colorinterp = (colour,)
+    with pytest.raises(ConfigError, match="is a colour image; give the heights"):
+        open_terrain(path)
+
+
+def test_complex_numbers_are_a_clear_error(tmp_path: Path) -> None:
+    path = write_raster(tmp_path / "a.tif", slope(), dtype="complex64", nodata=None)
+    with pytest.raises(ConfigError, match="holds complex numbers"):
+        open_terrain(path)
 
 
 def test_terrain_of_no_data_is_a_clear_error(tmp_path: Path) -> None:

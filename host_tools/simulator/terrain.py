@@ -24,6 +24,8 @@ BUILT_IN_CELLS = 600
 COARSE_CELLS = 4_000_000
 LEAST_OTHER_SIGN_SHARE = 0.1
 """Of a grid that is mostly above zero: with more below it, it may be sea beside higher land."""
+MOST_ZEROS_SHARE = 0.01
+"""Of a grid that declares no no-data: with more cells of exactly zero, it may mean them by that."""
 FILLS = (-9999, 9999, -32768, -32767, 32767, -99999, 99999, -999999)
 """Stored where nothing was measured: believed of files that declare no such value themselves."""
 COLOURS = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.palette)
@@ -37,8 +39,8 @@ class Raster:
     """A north-up grid of elevations in a projected system in metres; row 0 is the northernmost.
 
     `read` may be asked for any window; `coarse_m` (R, C) is the whole grid thinned for planning,
-    NaN where there is no data. remarks say what was taken for no data though the file does not
-    call it so, and that stored depths were turned over.
+    NaN where there is no data. remarks say what was or might be taken for no data though the file
+    does not call it so, and that stored depths were turned over.
     """
 
     name: str
@@ -105,6 +107,9 @@ def open_terrain(path: Path | None, relief_seed: int = 1) -> Raster:
             known = np.isfinite(elevation_m)
             if not known.any():
                 raise ConfigError(f"terrain {path} {_why_nothing(values)}")
+            remarks = _remarks(path.name, stored, known, positive_down=positive_down)
+            if dataset.nodata is None:
+                remarks += _remark_on_zeros(path.name, known & (stored.data == 0))
             return Raster(
                 name=path.name,
                 path=path,
@@ -114,7 +119,7 @@ def open_terrain(path: Path | None, relief_seed: int = 1) -> Raster:
                 columns=dataset.width,
                 coarse_m=elevation_m,
                 positive_down=positive_down,
-                remarks=_remarks(path.name, stored, known, positive_down=positive_down),
+                remarks=remarks,
             )
     except RasterioError as error:
         raise ConfigError(f"terrain {path} cannot be read as a raster: {error}") from error
@@ -206,6 +211,16 @@ def _remarks(
         *remarks,
         f"terrain {name}: {untold.mean():.1%} of its cells hold values ({held}) that no seabed "
         "has, and are taken as unknown; declare them as no-data (gdal_edit.py -a_nodata)",
+    )
+
+
+def _remark_on_zeros(name: str, is_zero: NDArray[np.bool_]) -> tuple[str, ...]:
+    """Return a remark if more cells (R, C) than by chance are zero, where none is declared."""
+    if is_zero.mean() <= MOST_ZEROS_SHARE:
+        return ()
+    return (
+        f"terrain {name}: {is_zero.mean():.1%} of its cells are exactly 0; if nothing was measured "
+        "there, declare it (gdal_edit.py -a_nodata 0)",
     )
 
 

@@ -157,6 +157,20 @@ def test_a_fill_stored_in_other_units_is_no_seabed_either(tmp_path: Path) -> Non
     assert np.isnan(open_terrain(path).read(150, 0, 50, 300)).all()
 
 
+@pytest.mark.parametrize(
+    ("rows", "nodata", "remarks"), [(30, None, 1), (2, None, 0), (30, -9999.0, 0), (30, 0.0, 0)]
+)
+def test_many_zeros_are_told_where_no_data_is_undeclared(
+    tmp_path: Path, rows: int, nodata: float | None, remarks: int
+) -> None:
+    elevation_m = slope()
+    elevation_m[:rows] = 0.0
+    terrain = open_terrain(write_raster(tmp_path / "a.tif", elevation_m, nodata=nodata))
+    assert len(terrain.remarks) == remarks
+    for remark in terrain.remarks:
+        assert "a.tif: 10.0% of its cells are exactly 0; if nothing was measured" in remark
+
+
 def test_declared_no_data_is_no_remark(tmp_path: Path) -> None:
     elevation_m = slope()
     elevation_m[150:200] = -9999.0

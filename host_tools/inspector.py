@@ -125,9 +125,10 @@ def describe(frame: bytes) -> str:
     header = packet.header
     name = Profile(header.profile).name.lower().replace("_", " ")
     sender = f"vehicle {header.vehicle} epoch {header.boot_epoch}"
-    part = f"submap {header.submap} fragment {header.fragment}/{header.fragment_count}"
+    part = f"submap {header.submap} fragment {header.fragment}/{header.fragment_count}  "
+    part = part if "submap" in name else ""  # in others these fields mean something else
     when = f"t {header.time_quarters / 4:.2f} s, sent at second {header.tx_second} of 16"
-    return f"{name:<16} {sender}  {part}  {when}  {_content(packet)}"
+    return f"{name:<16} {sender}  {part}{when}  {_content(packet)}"
 
 
 def _content(packet: Packet) -> str:
@@ -148,7 +149,8 @@ def _content(packet: Packet) -> str:
             return f"{int(good.sum())} states to north {last[0]:.1f} m, east {last[1]:.1f} m"
         case Answer() | ExtendedAnswer():
             return (
-                f"to vehicle {packet.to_vehicle}, submap {packet.submap}: "
+                f"to vehicle {packet.to_vehicle} epoch {packet.to_boot_epoch}, "
+                f"submap {packet.submap}: "
                 f"north {packet.north_m:.1f} m, east {packet.east_m:.1f} m"
             )
         case SubmapFragment():

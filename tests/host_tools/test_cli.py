@@ -20,7 +20,7 @@ def frames() -> list[bytes]:
             boot_epoch=0,
             submap=3,
             fragment=1,
-            fragment_count=0,
+            fragment_count=4,
             tx_second=3,
             time_quarters=480,
         ),
@@ -141,7 +141,9 @@ def test_inspect_describes_frames_and_steps_over_garbage(
     assert main(["inspect", str(path)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 4
-    assert "to vehicle 1, submap 2: north 120.5 m, east -4.0 m" in lines[0]
+    assert "to vehicle 1 epoch 4, submap 2: north 120.5 m, east -4.0 m" in lines[0]
+    assert "fragment" not in lines[0]
+    assert "submap 3" not in lines[0]  # that field of an answer holds a sigma and a count
     assert "8 bytes that are no frame" in lines[1]
     assert "submap 12 fragment 7/10" in lines[2]
     assert "15 points" in lines[2]

@@ -37,12 +37,15 @@ def read_frames(path: Path) -> Iterator[tuple[str, Captured]]:
     Raises
     ------
     ConfigError
-        When the file cannot be read, or is no air.jsonl and holds no whole frame.
+        When the file cannot be read, or is no air.jsonl, which may be empty, and holds no whole
+        frame.
     """
     try:
         data = path.read_bytes()
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from error
+    if not data and path.suffix == ".jsonl":
+        return  # a mission of one vehicle
     if not data:
         raise ConfigError(f"{path} is empty; give a file of frames or an air.jsonl")
     if data.lstrip()[:1] == b"{":

@@ -188,6 +188,16 @@ def test_inspect_reads_air_and_says_why_a_frame_is_dropped(
     assert "CRC" in second
 
 
+def test_inspect_of_the_air_of_one_vehicle_shows_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "air.jsonl"
+    path.write_bytes(b"")
+    assert main(["inspect", str(path)]) == 0
+    captured = capsys.readouterr()
+    assert (captured.out, captured.err) == ("", "")
+
+
 AIR = b'{"t_tx_s": 1.0, "t_rx_s": null, "source": %s, "destination": 0, "hex": "", "fate": ""}'
 
 

@@ -15,7 +15,7 @@ from host_tools.evaluation import Evaluation, evaluate
 from host_tools.mapping import DepthMap
 from host_tools.mission import Progress, local_nodes, run, simulated_vehicles, water_between
 from host_tools.mission_settings import MissionSettings, check_air
-from host_tools.registration import SEARCH_M
+from host_tools.registration import SEARCH_M, TileShifts
 from host_tools.report import write_report
 from host_tools.results import MissionResult
 from host_tools.simulator.placement import place_survey
@@ -88,14 +88,22 @@ def outcome_lines(evaluation: Evaluation) -> list[str]:
             f"{live.mean_m:8.2f} m {live.share_of_dead_reckoning:6.1%} "
             f"{final.mean_m:9.2f} m {final.share_of_dead_reckoning:6.1%} {final.end_m:8.2f} m"
         )
-    error, tiles = evaluation.registration, evaluation.tiles
-    far = f", {tiles.far_tiles} by {SEARCH_M:.0f} m or more" if tiles.far_tiles else ""
+    error = evaluation.registration
     lines.append(
         f"map against truth-navigated map: mean {error.mean_m:.3f} m, "
         f"median {error.median_m:.3f} m, {error.share_under_1m:.1%} under 1 m; "
-        f"tiles shifted by {tiles.median_m:.2f} m in the median{far}"
+        f"{_shifts(evaluation.tiles)}"
     )
     return lines
+
+
+def _shifts(tiles: TileShifts) -> str:
+    if tiles.tiles:
+        far = f", {tiles.far_tiles} by {SEARCH_M:.0f} m or more" if tiles.far_tiles else ""
+        return f"tiles shifted by {tiles.median_m:.2f} m in the median{far}"
+    if tiles.far_tiles:
+        return f"all tiles that tell their shift are off by {SEARCH_M:.0f} m or more"
+    return "no tile has relief enough to tell its shift"
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:

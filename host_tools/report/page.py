@@ -122,13 +122,13 @@ def _error_row(name: str, errors: TrajectoryErrors) -> list[str]:
 
 def _map_text(evaluation: Evaluation) -> str:
     error, tiles = evaluation.registration, evaluation.tiles
+    spread = f": median {tiles.median_m:.2f} m, 95 % {tiles.p95_m:.2f} m" if tiles.tiles else ""
     return (
         f"<p>Against the map of the same soundings placed by true navigation: mean "
         f"{error.mean_m:.3f} m, median {error.median_m:.3f} m, {error.share_under_half_m:.1%} "
         f"under 0.5 m, {error.share_under_1m:.1%} under 1 m ({error.cells} cells). "
-        f"Horizontal shift of {tiles.tiles} tiles of 100 m: median {tiles.median_m:.2f} m, 95 % "
-        f"{tiles.p95_m:.2f} m; {tiles.far_tiles} more are {SEARCH_M:.0f} m off or farther, "
-        f"{tiles.flat_tiles} too flat to say.</p>"
+        f"Horizontal shift of {tiles.tiles} tiles of 100 m{spread}; {tiles.far_tiles} more are "
+        f"{SEARCH_M:.0f} m off or farther, {tiles.flat_tiles} too flat to say.</p>"
     )
 
 

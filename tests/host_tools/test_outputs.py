@@ -16,10 +16,12 @@ from host_tools.evaluation import (
     evaluate,
 )
 from host_tools.mapping import DepthMap
+from host_tools.registration import TileShifts
 from host_tools.report import write_report
 from host_tools.report.figures import maps
 from host_tools.results import MissionResult, SoundingPatch, VehicleResult
 from host_tools.scenario import ScenarioSettings, named_scenario
+from host_tools.simulate import outcome_lines
 from host_tools.simulator.placement import Site, place_survey
 from host_tools.simulator.terrain import open_terrain
 from host_tools.simulator.vehicle import SimulatedVehicle
@@ -245,6 +247,22 @@ def test_report_is_one_file_that_needs_no_other(mission: MissionResult, tmp_path
     assert "rotation about the range is unobservable" in page
     assert "http" not in page.replace("http-equiv", "")
     assert not re.search(r"<(script|link)\b", page)
+
+
+@pytest.mark.parametrize(
+    ("far_tiles", "said"),
+    [(0, "no tile has relief enough to tell"), (3, "all tiles that tell their shift are off by")],
+)
+def test_a_shift_that_no_tile_tells_is_no_number(
+    mission: MissionResult, tmp_path: Path, far_tiles: int, said: str
+) -> None:
+    nan = float("nan")
+    untold = TileShifts(tiles=0, flat_tiles=25, far_tiles=far_tiles, median_m=nan, p95_m=nan)
+    evaluation = dataclasses.replace(evaluate(mission), tiles=untold)
+    assert said in outcome_lines(evaluation)[-1]
+    assert "nan" not in outcome_lines(evaluation)[-1]
+    write_report(mission, evaluation, tmp_path / "report.html")
+    assert "nan m" not in (tmp_path / "report.html").read_text()
 
 
 def test_an_earlier_mission_is_removed_by_name_and_nothing_else(tmp_path: Path) -> None:

@@ -136,6 +136,13 @@ def parse_changes(texts: Sequence[str]) -> dict[str, object]:
     return changes
 
 
+def folder_of(text: str) -> Path:
+    """Return the text as a folder; an empty one would mean the current folder."""
+    if not text:
+        raise argparse.ArgumentTypeError("the name is empty; give a folder, such as out/mine")
+    return Path(text)
+
+
 def count(text: str) -> int:
     """Return the text as a number of something, 1 or more."""
     value = int(text)

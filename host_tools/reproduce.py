@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from host_tools.commands import BASELINES, Command, count
+from host_tools.commands import BASELINES, Command, count, folder_of
 from host_tools.evaluation import Evaluation, as_plain, closure_counts, evaluate
 from host_tools.matching_trial import PAIRS, TrialResult, run_trial, trial_lines
 from host_tools.mission_settings import MissionSettings, changed
@@ -147,7 +147,9 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--pairs", type=count, default=PAIRS, metavar="N", help=f"of Figure 8; default {PAIRS}"
     )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="write the figures there as well")
+    parser.add_argument(
+        "--out", type=folder_of, metavar="DIR", help="write the figures there as well"
+    )
 
 
 def _run(arguments: argparse.Namespace) -> None:

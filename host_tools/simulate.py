@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from host_tools.baselines import Unheard
 from host_tools.collect import Mission, mission_result
-from host_tools.commands import Command, add_mission_arguments, settings_of
+from host_tools.commands import Command, add_mission_arguments, folder_of, settings_of
 from host_tools.evaluation import Evaluation, evaluate
 from host_tools.mapping import DepthMap
 from host_tools.mission import Progress, local_nodes, run, simulated_vehicles, water_between
@@ -109,7 +109,7 @@ def _shifts(tiles: TileShifts) -> str:
 def _configure(parser: argparse.ArgumentParser) -> None:
     add_mission_arguments(parser)
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="where the outputs go"
+        "--out", type=folder_of, required=True, metavar="DIR", help="where the outputs go"
     )
     parser.add_argument(
         "--store", type=Path, metavar="DIR", help="where vehicles keep their stores; default: none"

@@ -10,7 +10,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from host_tools.collect import Mission, result_of_record
-from host_tools.commands import Command
+from host_tools.commands import Command, folder_of
 from host_tools.evaluation import evaluate
 from host_tools.mapping import DepthMap
 from host_tools.mission import Progress, run, simulated_vehicles, water_between
@@ -187,7 +187,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--ports", type=Path, metavar="DIR", help="where the ports' names go (default: /tmp)"
     )
-    parser.add_argument("--out", type=Path, default=Path("out/channel"), metavar="DIR")
+    parser.add_argument("--out", type=folder_of, default=Path("out/channel"), metavar="DIR")
     parser.add_argument("--no-report", action="store_true", help="leave report.html out")
 
 

@@ -13,7 +13,7 @@ from typing import IO
 
 from tqdm import tqdm
 
-from host_tools.commands import Command
+from host_tools.commands import Command, folder_of
 from host_tools.processes.channel import (
     add_modem_argument,
     finish,
@@ -136,7 +136,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     add_modem_argument(parser)
     parser.set_defaults(changes=list(SHORTENED))  # what --set gives comes later, and counts
     parser.add_argument(
-        "--out", type=Path, default=Path("out/demo"), metavar="DIR", help="default: out/demo"
+        "--out", type=folder_of, default=Path("out/demo"), metavar="DIR", help="default: out/demo"
     )
 
 

@@ -28,7 +28,7 @@ from firmware.ports import SensorStep
 from firmware.vehicle_core import VehicleCore
 from firmware.vehicle_loop import VehicleLoop
 from host_tools.collect import leader_record
-from host_tools.commands import Command
+from host_tools.commands import Command, folder_of
 from host_tools.link_status import advice_lines
 from host_tools.mapping import DepthMap
 from host_tools.mission import deployed
@@ -330,7 +330,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--start", default="next", metavar="UTC", help="with the wall clock; default: next minute"
     )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="where the vehicle's files go")
+    parser.add_argument("--out", type=folder_of, metavar="DIR", help="where the vehicle's files go")
     parser.add_argument(
         "--store", type=Path, metavar="DIR", help="what a restart resumes from; default: none"
     )

@@ -132,6 +132,18 @@ def test_unreadable_arguments_are_one_line_and_status_2(
     assert capsys.readouterr().err.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    "command", ["simulate", "demo", "channel", "follower", "leader", "reproduce"]
+)
+def test_a_folder_without_a_name_is_not_the_current_one(
+    command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main([command, "--out", "", "--seed"])  # which has no value, so that nothing begins
+    assert stopped.value.code == 2
+    assert "argument --out: the name is empty; give a folder" in capsys.readouterr().err
+
+
 def test_inspect_describes_frames_and_steps_over_garbage(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

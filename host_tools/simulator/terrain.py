@@ -130,8 +130,13 @@ def _check_reference(path: Path, dataset: DatasetReader) -> None:
     wanted = "reproject it to a metric projection such as UTM (gdalwarp -t_srs EPSG:326xx)"
     if dataset.count < 1:
         raise ConfigError(f"terrain {path} has no raster band")
+    if crs is None and dataset.gcps[0]:
+        raise ConfigError(f"terrain {path} has ground control points, not a grid; {wanted}")
     if crs is None:
-        raise ConfigError(f"terrain {path} has no coordinate reference system; {wanted}")
+        raise ConfigError(
+            f"terrain {path} has no coordinate reference system; assign the one its grid is in "
+            "(gdal_edit.py -a_srs EPSG:326xx)"
+        )
     if not crs.is_projected:
         raise ConfigError(f"terrain {path} is not in a projected system ({crs}); {wanted}")
     if abs(crs.linear_units_factor[1] - 1.0) > 1e-9:

@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 import rasterio
 from affine import Affine
+from rasterio.control import GroundControlPoint
+from rasterio.crs import CRS
 from rasterio.enums import ColorInterp
 
 from host_tools.scenario import named_scenario
@@ -187,10 +189,29 @@ def test_not_a_raster_is_a_clear_error(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
-@pytest.mark.parametrize("crs", [None, "EPSG:4326"])
-def test_terrain_without_projected_system_is_a_clear_error(tmp_path: Path, crs: str | None) -> None:
+@pytest.mark.parametrize(
+    ("crs", "said"),
+    [
+        (None, r"no coordinate reference system; assign the one .*gdal_edit.py -a_srs"),
+        ("EPSG:4326", r"not in a projected system .*; reproject it .*gdalwarp"),
+    ],
+)
+def test_terrain_without_projected_system_is_a_clear_error(
+    tmp_path: Path, crs: str | None, said: str
+) -> None:
     path = write_raster(tmp_path / "a.tif", slope(), crs=crs)
-    with pytest.raises(ConfigError, match=r"projected|coordinate reference system"):
+    with pytest.raises(ConfigError, match=said):
+        open_terrain(path)
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_terrain_with_ground_control_points_is_to_be_warped(tmp_path: Path) -> None:
+    path = write_raster(tmp_path / "a.tif", slope(), crs=None)
+    with rasterio.open(path, "r+") as dataset:
+        corners = [(0, 0), (300, 0), (0, 300)]
+        points = [GroundControlPoint(r, c, 350_000 + 5 * c, 4_680_000 - 5 * r) for r, c in corners]
+        dataset.gcps = (points, CRS.from_epsg(32619))
+    with pytest.raises(ConfigError, match=r"has ground control points, not a grid; .*gdalwarp"):
         open_terrain(path)
 
 

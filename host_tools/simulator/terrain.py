@@ -93,7 +93,10 @@ def open_terrain(path: Path | None, relief_seed: int = 1) -> Raster:
     if path is None:
         return _built_in(relief_seed)
     if not path.is_file():
-        raise ConfigError(f"terrain {path} is not a file; give a GeoTIFF, a BAG or another raster")
+        raise ConfigError(
+            f"terrain {path} is not a file on disk; give a GeoTIFF, a BAG or another raster, or "
+            "convert what it names to one with gdal_translate"
+        )
     try:
         with rasterio.open(path) as dataset:
             _check_reference(path, dataset)

@@ -184,8 +184,8 @@ def test_not_a_raster_is_a_clear_error(tmp_path: Path) -> None:
     path.write_text("soundings to follow")
     with pytest.raises(ConfigError, match="cannot be read as a raster"):
         open_terrain(path)
-    with pytest.raises(ConfigError, match="is not a file"):
-        open_terrain(tmp_path / "missing.tif")
+    with pytest.raises(ConfigError, match=r"is not a file on disk; .* with gdal_translate"):
+        open_terrain(Path(f"/vsizip/{tmp_path}/a.zip/a.tif"))
 
 
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")

@@ -29,7 +29,10 @@ MOST_ZEROS_SHARE = 0.01
 FILLS = (-9999, 9999, -32768, -32767, 32767, -99999, 99999, -999999)
 """Stored where nothing was measured: believed of files that declare no such value themselves."""
 COLOURS = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.palette)
-METRES = ("m", "metre", "metres", "meter", "meters")
+OTHER_UNITS = re.compile(
+    r"(us survey )?(ft|f[eo]{2}t|fathom|yard|inch)|[cdmk]m\b|(centi|deci|milli|kilo)met", re.I
+)
+"""Of heights; names that files have for metres are past counting."""
 VERTICAL_UNIT = re.compile(r'VERT_?CR?S\[.*?UNIT\["(.+?)",([\d.eE+-]+)', re.DOTALL)
 """Name and metres of the unit of heights in the text of a compound system."""
 
@@ -149,7 +152,7 @@ def _check_reference(path: Path, dataset: DatasetReader) -> None:
 
 
 def _check_heights(path: Path, dataset: DatasetReader) -> None:
-    if dataset.colorinterp[0] in COLOURS:
+    if dataset.dtypes[0] == "uint8" and dataset.colorinterp[0] in COLOURS:
         raise ConfigError(f"terrain {path} is a colour image; give the heights it was drawn from")
     if dataset.dtypes[0].startswith("complex"):
         raise ConfigError(f"terrain {path} holds complex numbers; give heights")
@@ -160,8 +163,8 @@ def _check_heights(path: Path, dataset: DatasetReader) -> None:
             f"terrain {path} is in a system with heights in {vertical[1]}, not in metres; "
             f"{told} and name its horizontal system alone (-a_srs EPSG:326xx)"
         )
-    unit = dataset.units[0]
-    if unit and unit.strip().lower() not in METRES:
+    unit = dataset.units[0] or ""
+    if OTHER_UNITS.match(unit.strip()):
         raise ConfigError(f"terrain {path} holds heights in {unit}, not in metres; {told}")
 
 

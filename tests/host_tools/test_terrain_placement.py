@@ -231,7 +231,7 @@ def test_heights_in_another_unit_are_a_clear_error_until_their_scale_is_told(
     with pytest.raises(ConfigError, match=f"holds heights in {unit}, not in metres; tell how"):
         open_terrain(path)
     with rasterio.open(path, "r+") as dataset:
-        dataset.units, dataset.scales = ("Metre",), (0.3048,)
+        dataset.units, dataset.scales = ("Meters above MLLW",), (0.3048,)
     np.testing.assert_allclose(open_terrain(path).coarse_m, 0.3048 * slope(), rtol=1e-6)
 
 

@@ -91,12 +91,10 @@ class Solver:
             if self._isam.treeNnz() > _WORN * self._tree_entries:
                 self._rebuild(self._values)
         except RuntimeError:
-            self._factorization = "QR"
             for key in self._fresh.keys():
                 if not self._values.exists(key):
                     self._values.insert(key, self._fresh.atVector(key))
-            self._rebuild(self._values)
-            self.rebuilds += 1
+            self._rebuild_by_qr(self._values)
         self._fresh = gtsam.Values()
         self._changed.clear()
         return True
@@ -108,9 +106,7 @@ class Solver:
         try:
             self._rebuild(values)
         except RuntimeError:
-            self._factorization = "QR"
-            self._rebuild(values)
-            self.rebuilds += 1
+            self._rebuild_by_qr(values)
         self._fresh = gtsam.Values()
         self._changed.clear()
 
@@ -150,6 +146,11 @@ class Solver:
         if numbers or removed:
             self._isam.update()  # a robust weight follows its residual one step late
         self._values = self._isam.calculateEstimate()
+
+    def _rebuild_by_qr(self, values: gtsam.Values) -> None:
+        self._factorization = "QR"
+        self._rebuild(values)
+        self.rebuilds += 1
 
     def _rebuild(self, values: gtsam.Values) -> None:
         for entry in self._ledger.values():

@@ -7,7 +7,7 @@ what the second and third of them say counts for less.
 """
 
 import logging
-from collections import Counter, OrderedDict, deque
+from collections import Counter, OrderedDict
 from dataclasses import dataclass, replace
 
 from firmware.leader.atlas import Atlas, Sheet, SheetId
@@ -38,14 +38,6 @@ class OpenPair:
     hint: int | None = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Heard:
-    """A hint that was entered, and the sub-maps that it comes from."""
-
-    number: int
-    ends: Ends
-
-
 class OpenPairs:
     """Open pairs by the sheet that was matched, bounded by the number of such sheets."""
 
@@ -53,7 +45,7 @@ class OpenPairs:
         self.counters: Counter[str] = Counter()
         self._settings = settings
         self._of: OrderedDict[SheetId, dict[SheetId, OpenPair]] = OrderedDict()
-        self._hints: deque[_Heard] = deque(maxlen=_HEARD)
+        self._heard: OrderedDict[int, Ends] = OrderedDict()  # hints by number, the oldest first
 
     def note(self, job: MatchJob, outcome: MatchOutcome) -> None:
         """Remember a pair that a match left open; forget one that failed otherwise."""
@@ -160,27 +152,24 @@ class OpenPairs:
             self.settle(*pair)
             if hint is not None:
                 judgement.drop_hint(hint, graph)
-                self._forget_hint(hint)
+                self._heard.pop(hint, None)  # and its neighbours count for no less
         elif outcome.hint is not None and hint is None:
             ends = _ends_of(job)
-            told = outcome.hint.repeated(self._heard(ends, graph))
+            told = outcome.hint.repeated(self._heard_alike(ends, graph))
             number = enter_hint(job, told, graph, self._settings)
             judgement.note_hint(number)
             self.note_hint(*pair, number)
             if number is not None:
-                self._hints.append(_Heard(number=number, ends=ends))
+                self._heard[number] = ends
+            if len(self._heard) > _HEARD:
+                self._heard.popitem(last=False)
 
-    def _forget_hint(self, number: int) -> None:
-        """Let a hint that was dropped make those of its neighbours count for no less."""
-        others = (hint for hint in self._hints if hint.number != number)
-        self._hints = deque(others, maxlen=_HEARD)
-
-    def _heard(self, ends: Ends, graph: PoseGraph) -> int:
+    def _heard_alike(self, ends: Ends, graph: PoseGraph) -> int:
         """Return how many hints of neighbours of a pair's sub-maps are believed."""
         return sum(
-            graph.is_active(hint.number) or hint.number not in graph  # then it was composed
-            for hint in self._hints
-            if _see_alike(hint.ends, ends) or _see_alike(hint.ends, ends[::-1])
+            graph.is_active(number) or number not in graph  # then it was composed
+            for number, heard in self._heard.items()
+            if _see_alike(heard, ends) or _see_alike(heard, ends[::-1])
         )
 
     def __len__(self) -> int:

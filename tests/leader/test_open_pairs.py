@@ -301,8 +301,8 @@ def test_neighbouring_pairs_together_tell_less_than_two(
         )
         again = dataclasses.replace(job, target=target)
         pairs.keep_or_settle(again, dataclasses.replace(outcome, hint=hint), graph, judgement)
-        entered_m2.append(graph.closure(pairs._hints[-1].number).covariance_m2)
-    assert len(pairs._hints) == 4
+        entered_m2.append(graph.closure(next(reversed(pairs._heard))).covariance_m2)
+    assert len(pairs._heard) == 4
     lone_m2 = entered_m2[0] - hint.covariance_m2  # of the walk of dead reckoning
     for covariance_m2, said_before in zip(entered_m2, (0, 1, 2, 2), strict=True):
         told_m2 = (1 + said_before) ** 2 * hint.covariance_m2
@@ -324,7 +324,7 @@ def test_match_takes_the_place_of_the_hint(graph: PoseGraph) -> None:
     pairs.keep_or_settle(job, found, graph, judgement)
     assert not graph.is_active(number)
     assert len(pairs) == 0
-    assert not pairs._hints  # once the graph has let it go it would be taken for composed
+    assert not pairs._heard  # once the graph has let it go it would be taken for composed
 
 
 @pytest.fixture

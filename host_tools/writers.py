@@ -79,8 +79,21 @@ def forget_mission(folder: Path, terrain: Path | None) -> None:
 
 
 def write_outputs(result: MissionResult, evaluation: Evaluation, folder: Path) -> None:
-    """Write every file of the contract but report.html; summary.json once the others are whole."""
+    """Write every file of the contract but report.html; summary.json once the others are whole.
+
+    Raises
+    ------
+    ConfigError
+        When they cannot be written, as to a full disk.
+    """
     prepare_folder(folder)
+    try:
+        _write_all(result, evaluation, folder)
+    except OSError as error:
+        raise ConfigError(f"cannot write all files to --out {folder}: {error.strerror}") from error
+
+
+def _write_all(result: MissionResult, evaluation: Evaluation, folder: Path) -> None:
     for vehicle in result.vehicles:
         write_trajectories(vehicle, result.site.datum, folder)
     write_closures(evaluation.closures, folder / "closures.csv")

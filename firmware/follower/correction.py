@@ -28,6 +28,7 @@ from protocol.settings import setting
 
 _CHI_SQUARE_1_99, _CHI_SQUARE_2_999 = 6.6, 13.8  # shares of true innovations that lie below
 _LEAST_NEWS = 0.05  # an answer hardly surer than dead reckoning alone is left out
+_SHORT_STEP_S = 120.0  # of a clock set back: answers are as old
 _KEPT = 96  # answers, ranges and losses of eight minutes; older ones are in the beginning
 
 
@@ -180,14 +181,21 @@ class DriftCorrection:
     def set_back(self, from_s: float, to_s: float) -> None:
         """Let what is known by now be known at the time to which the clock was set back.
 
-        Where all that was seen is older than that it keeps its times.
+        By a step shorter than answers are old, what was seen keeps its time, unless that is yet to
+        come: answers on their way tell of times before it.
         """
         self._lost = [replace(lost, time_s=min(lost.time_s, to_s)) for lost in self._lost]
         self._losing_s = (np.inf, -np.inf)
+        if from_s - to_s < _SHORT_STEP_S and self._base.time_s <= to_s:
+            seen = [replace(s.one, time_s=min(s.one.time_s, to_s)) for s in self._seen]
+            self._seen = []
+            self._filter_on(seen)
+            return
         newest = self._seen[-1].state if self._seen else self._base
-        if newest.time_s > to_s:
-            now = self._filter.predicted(newest, max(from_s, newest.time_s))
-            self._base, self._seen, self._aside = replace(now, time_s=to_s), [], None
+        now = self._filter.predicted(newest, max(from_s, newest.time_s))
+        self._base, self._seen, self._aside = replace(now, time_s=to_s), [], None
+        begun_s = self._deployment.time_s - (from_s - to_s)
+        self._deployment = replace(self._deployment, time_s=begun_s)
 
     def corrected(self, time_s: float, reckoned_m: Array) -> tuple[Array, Array]:
         """Return the believed position (2,) at the time, and its covariance (2, 2)."""

@@ -276,7 +276,33 @@ def test_what_was_learned_by_a_clock_that_was_ahead_stays_when_it_is_set_right()
 
 
 def test_a_clock_set_back_by_less_than_answers_are_old_leaves_them_their_times() -> None:
+    """Even where a range was heard in the last quarter of a second before."""
     correction = taught(600.0)
-    correction.set_back(700.0, 690.0)
+    leader_m = np.array([500.0, 0.0])
+    assert correction.receive_range(699.9, drift_m(699.9), leader_m, 1.0, 500.0, 0.0)
+    correction.set_back(700.0, 699.75)
     assert correction.receive_answer(640.0, drift_m(640.0), np.zeros(2))
     assert correction.stale == 0
+
+
+@pytest.mark.parametrize("told_until_s", [0.0, 600.0])
+def test_a_follower_that_heard_nothing_for_long_doubts_all_of_it_when_its_clock_is_set_back(
+    told_until_s: float,
+) -> None:
+    correction = taught(told_until_s)
+    before_m = alone_sigma_m(correction, 4000.0)
+    correction.set_back(4000.0, 700.0)
+    assert alone_sigma_m(correction, 700.0) == pytest.approx(before_m)
+
+
+def test_a_leader_that_changes_its_mind_after_a_clock_was_set_back_is_believed() -> None:
+    correction = DriftCorrection(5000.0, CorrectionSettings())
+    for time_s in np.arange(5080.0, 6240.0, 40.0):
+        correction.receive_answer(float(time_s), drift_m(time_s), np.zeros(2), sigma_m=2.0)
+    correction.set_back(6260.0, 260.0)
+    moved_m = np.array([300.0, 0.0])
+    for time_s in np.arange(280.0, 680.0, 40.0):
+        correction.receive_answer(float(time_s), drift_m(time_s + 6000.0), moved_m, sigma_m=2.0)
+    assert (correction.stale, correction.restarted) == (0, 1)
+    position_m, _ = correction.corrected(660.0, drift_m(6660.0))
+    assert position_m == pytest.approx(moved_m, abs=5.0)

@@ -17,6 +17,8 @@ from protocol.errors import EstimationError
 from protocol.settings import Settings, setting
 from protocol.vehicles import LEADER
 
+_SWIFT_MPS = 5.0  # no survey is faster
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FixSettings(Settings):
@@ -82,11 +84,15 @@ class Fixes:
                 self.counters["fixes_unplaceable"] += 1
 
     def _is_alike(self, time_s: float, fix: Fix) -> bool:
-        """Return whether a fix is hardly surer than one of its vehicle shortly before or after."""
+        """Return whether a fix is hardly surer than one of its vehicle shortly before or after.
+
+        One that it contradicts may be the wild one of the two: both are judged.
+        """
         return any(
             other.vehicle == fix.vehicle
             and abs(time_s - other_s) < self._settings.apart_s
             and fix.sigma_m > other.sigma_m / 2.0
+            and _agree(fix, other, abs(time_s - other_s))
             for other_s, other in (*self._held, *self._used.values())
         )
 
@@ -104,3 +110,9 @@ class Fixes:
         graph.update()
         self._used[fix.vehicle] = time_s, fix
         return "fixes_used"
+
+
+def _agree(fix: Fix, other: Fix, apart_s: float) -> bool:
+    """Return whether a vehicle may have been at both."""
+    apart_m = np.hypot(fix.north_m - other.north_m, fix.east_m - other.east_m)
+    return bool(apart_m <= 3.0 * (fix.sigma_m + other.sigma_m) + _SWIFT_MPS * apart_s)

@@ -109,6 +109,18 @@ def test_fixes_of_a_follower_leave_room_for_those_of_another() -> None:
     assert (status["fixes_used"], status["fixes_alike"]) == (2, 99)
 
 
+def test_a_wild_fix_that_waits_leaves_good_ones_after_it_their_turn() -> None:
+    sea = convoy().run(0.0, 30.0)
+    for second in range(6):
+        at_s = 30.25 + second
+        off_m = 2000.0 if second == 0 else 0.0
+        fix = Fix(vehicle=1, north_m=-30.0 + 2.0 * at_s + off_m, east_m=60.0, sigma_m=1.0)
+        sea.leader.receive_odometry(sample(at_s, fix))
+    status = sea.run(36.25, 100.0).leader.status()
+    counts = [status[f"fixes_{fate}"] for fate in ("rejected", "used", "alike")]
+    assert counts == [1, 1, 4]
+
+
 def test_odometry_with_a_fix_reads_back_exactly() -> None:
     fix = Fix(vehicle=2, north_m=1 / 3, east_m=-7.0, sigma_m=0.1)
     sample = Odometry(

@@ -91,6 +91,10 @@ class OpenPairs:
             offsets = {(o.origin.id, o.target.id): o for o in offsets_of(pairs, graph)}
         except EstimationError:
             offsets = {}
+        except Exception:
+            LOG.exception("the offsets of open pairs were not found")
+            self.counters["second_looks_raised"] += 1
+            offsets = {}
         for target, partners in turns:
             if len(looks) >= self._settings.pairs_per_submap:
                 break
@@ -114,7 +118,7 @@ class OpenPairs:
     ) -> list[tuple[Sheet, list[tuple[Sheet, OpenPair]]]]:
         """Return the sheets that were not looked at for longest, with the partners of each.
 
-        The new one that they go beside is none of them. Sheets that are matched no more are
+        The sheet that they go beside is left out. Sheets that are matched no more are
         forgotten. A partner whose hint was composed with others is passed over: nobody knows any
         more what the pair itself has told.
         """
@@ -152,7 +156,7 @@ class OpenPairs:
             self.settle(*pair)
             if hint is not None:
                 judgement.drop_hint(hint, graph)
-                self._heard.pop(hint, None)  # and its neighbours count for no less
+                self._heard.pop(hint, None)  # it lessens its neighbours' no more
         elif outcome.hint is not None and hint is None:
             ends = _ends_of(job)
             told = outcome.hint.repeated(self._heard_alike(ends, graph))

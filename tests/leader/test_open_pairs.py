@@ -270,6 +270,18 @@ def test_a_second_look_that_raises_takes_nothing_else_along(
     assert closing.status()["second_looks_raised"] == 1
 
 
+def test_offsets_that_raise_leave_a_sheet_its_first_looks(
+    atlas: Atlas, graph: PoseGraph, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second, third, _ = _sheets(atlas)
+    closing = LoopClosing(graph, atlas, LeaderSettings(), Counter[str]())
+    closing._open.note(_job(first, second, 1e6), AMBIGUOUS)
+    closing.add(third)
+    monkeypatch.setattr(open_pairs, "offsets_of", MagicMock(side_effect=ValueError("no such row")))
+    assert closing.next_jobs() is not None
+    assert closing.status()["second_looks_raised"] == 1
+
+
 def test_first_looks_that_raise_leave_a_sheet_its_second_ones(
     atlas: Atlas, graph: PoseGraph, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -318,12 +318,13 @@ class Estimate:
         chain = self._chains[chain_id]
         here_m = self.trajectory(chain_id).correct(time_s, track.position_at(time_s))
         moved_m = here_m - self._state(key)[:2]
+        lost_m2 = abs(chain.lost_m2(chain.in_shape_s(time_s), time_s))
         return Anchor(
             key=key,
             parameters=chain.parameters,
             offset_m=as_reckoned(moved_m, self._state(chain.parameters)),
             time_s=time_s,
-            apart_m2=chain.apart_at_m2(time_s),
+            apart_m2=chain.apart_at_m2(time_s) + lost_m2 * np.eye(2),
         )
 
     def _forget_solution(self) -> None:

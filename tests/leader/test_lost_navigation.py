@@ -11,9 +11,11 @@ from firmware.dead_reckoning import LOST_SIGMA_MPS
 from firmware.follower.core import FollowerCore
 from firmware.leader.atlas import SheetId
 from firmware.leader.chains import Chain
+from firmware.leader.composition import CompositionSettings
 from firmware.leader.core import LeaderCore
 from firmware.leader.judgement import JudgementSettings, _Odometry
 from firmware.soundings import Fix, Odometry, Ping
+from firmware.submaps import Track
 from tests.leader.vessels import ANGLES_RAD, SHORT, Convoy, follower_of, leader_of, line, sail
 
 LOST_S = (200.0, 260.0)
@@ -300,3 +302,15 @@ def test_span_that_is_told_late_takes_no_doubt_from_another() -> None:
     assert all(begin_s < end_s for begin_s, end_s in chain.lost)
     for end_s, before_m2 in zip(ends_s, doubted_m2, strict=True):
         assert chain.lost_m2(20_000.0, end_s) >= before_m2
+
+
+def test_the_composed_past_doubts_ways_that_nobody_measured_as_well() -> None:
+    graph = leader_of(corner).graph
+    times_s = np.arange(3001.0)
+    track = Track(time_s=times_s, north_m=times_s, east_m=0 * times_s, yaw_rad=0 * times_s)
+    graph.lose(0, 1204.75, 1259.75)
+    graph.extend(0, track)
+    before_m2 = graph.anchor(0, 1236.0, track).apart_m2
+    graph.compose(3000.0, CompositionSettings())
+    assert before_m2[0, 0] > 40.0**2
+    assert graph.anchor(0, 1236.0, track).apart_m2[0, 0] >= before_m2[0, 0]

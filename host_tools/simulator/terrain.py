@@ -30,7 +30,9 @@ FILLS = (-9999, 9999, -32768, -32767, 32767, -99999, 99999, -999999)
 """Stored where nothing was measured: believed of files that declare no such value themselves."""
 COLOURS = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.palette)
 OTHER_UNITS = re.compile(
-    r"(us survey )?(ft|f[eo]{2}t|fathom|yard|inch)|[cdmk]m\b|(centi|deci|milli|kilo)met", re.I
+    r"((us|international|survey)[ _-])*(ft|f[eo]{2}t|fathom|yard|inch)"
+    r"|[cdmk]m\b|(centi|deci|milli|kilo)met",
+    re.I,
 )
 """Of heights; names that files have for metres are past counting."""
 VERTICAL_UNIT = re.compile(r'VERT_?CR?S\[.*?UNIT\["(.+?)",([\d.eE+-]+)', re.DOTALL)

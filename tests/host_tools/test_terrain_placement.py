@@ -221,7 +221,7 @@ def test_terrain_in_feet_is_a_clear_error(tmp_path: Path) -> None:
         open_terrain(path)
 
 
-@pytest.mark.parametrize("unit", ["ft", "cm", "US survey foot"])
+@pytest.mark.parametrize("unit", ["ft", "cm", "US survey foot", "us-ft", "US_survey_foot"])
 def test_heights_in_another_unit_are_a_clear_error_until_their_scale_is_told(
     tmp_path: Path, unit: str
 ) -> None:

@@ -26,7 +26,7 @@ _MAX_DEGREE = 7
 _MAX_STATES = 256
 
 
-def encode_track(track: Track, most_bytes: int = 46) -> bytes:
+def encode_track(track: Track, most_bytes: int = 45) -> bytes:
     """Return the bytes of a track of one state a second; missing seconds are interpolated.
 
     In few bytes a turn is smoothed; a straight track takes 15. Raises LocalProtocolError for a

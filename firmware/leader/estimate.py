@@ -101,7 +101,7 @@ class Estimate:
             )
         if in_shape:
             return self._anchor_in_shape(chain_id, key, time_s, track)
-        lost_m2 = abs(chain.lost_m2(chain.times_s[nearest], time_s))
+        lost_m2 = self.lost_m2(chain_id, chain.times_s[nearest], time_s)
         return Anchor(
             key=key,
             parameters=chain.parameters,
@@ -318,7 +318,7 @@ class Estimate:
         chain = self._chains[chain_id]
         here_m = self.trajectory(chain_id).correct(time_s, track.position_at(time_s))
         moved_m = here_m - self._state(key)[:2]
-        lost_m2 = abs(chain.lost_m2(chain.in_shape_s(time_s), time_s))
+        lost_m2 = self.lost_m2(chain_id, chain.in_shape_s(time_s), time_s)
         return Anchor(
             key=key,
             parameters=chain.parameters,

@@ -35,7 +35,8 @@ _COARSER = 4  # from level to level, pieces and the age at which they begin alik
 _VAGUE = 0.04  # of the information of a piece's surest closure: what tells less is but a hint
 Link = TypeVar("Link", ClosureRecord, RangeRecord)
 Kept = TypeVar("Kept", ClosureRecord, RangeRecord, AbsoluteRecord)
-Group = list[tuple[int, Entry, Kept]]  # of a piece or two: number, entry as it was, as moved
+Group = list[tuple[int, Kept]]  # active records of a piece or two: numbers, and as moved
+Groups = defaultdict[tuple[int, ...], Group[Kept]]  # by the keys of their nodes, ascending
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -135,33 +136,17 @@ class Composition:
     def coarse(self, ledger: Mapping[int, Entry]) -> Coarse:
         """Return what stays of a ledger, in order; what joins nodes of a chain is left out."""
         kept: dict[int, Entry] = {}
-        closures: dict[tuple[int, int], Group[ClosureRecord]] = defaultdict(list)
-        ranges: dict[tuple[int, int], Group[RangeRecord]] = defaultdict(list)
-        fixes: dict[int, Group[AbsoluteRecord]] = defaultdict(list)
+        closures: Groups[ClosureRecord] = defaultdict(list)
+        ranges: Groups[RangeRecord] = defaultdict(list)
+        fixes: Groups[AbsoluteRecord] = defaultdict(list)
         for number, entry in ledger.items():
             match entry.record:
                 case ClosureRecord() as closure:
-                    moved = self._moved(closure)
-                    if self._is_old(moved):
-                        told = moved.from_lower_key
-                        closures[told.origin.key, told.target.key].append((number, entry, moved))
-                        continue
-                    kept[number] = Entry(record=moved, active=entry.active)
+                    self._sort(number, self._moved(closure), entry, closures, kept)
                 case RangeRecord() as ranging:
-                    near = self._moved(ranging)
-                    if self._is_old(near):
-                        ranges[near.origin.key, near.target.key].append((number, entry, near))
-                        continue
-                    kept[number] = Entry(record=near, active=entry.active)
-                case AbsoluteRecord(anchor=anchor) as fix:
-                    record = replace(fix, anchor=self._anchored(anchor))
-                    if anchor.key in self._owners:
-                        spread_m2 = fix.covariance_m2 + self._apart_m2[anchor.key]
-                        record = replace(record, covariance_m2=spread_m2)
-                    if record.anchor.key in self._old:
-                        fixes[record.anchor.key].append((number, entry, record))
-                        continue
-                    kept[number] = Entry(record=record, active=entry.active)
+                    self._sort(number, self._moved(ranging), entry, ranges, kept)
+                case AbsoluteRecord() as fix:
+                    self._sort(number, self._moved_fix(fix), entry, fixes, kept)
                 case PriorRecord() | SharedDriftRecord() | TieRecord() as record:
                     kept[number] = Entry(record=record, active=entry.active)
         new: list[Record] = []
@@ -172,6 +157,21 @@ class Composition:
         for closure_group in self._thinned(closures):
             _keep(closure_group, self._one_closure, kept, new)
         return Coarse(kept=dict(sorted(kept.items())), new=new)
+
+    def _sort(
+        self, number: int, moved: Kept, entry: Entry, groups: Groups[Kept], kept: dict[int, Entry]
+    ) -> None:
+        """Keep an entry's record as moved; where all of its nodes are old, group it instead."""
+        ends = (
+            (moved.anchor,) if isinstance(moved, AbsoluteRecord) else (moved.origin, moved.target)
+        )
+        keys = tuple(sorted(end.key for end in ends))
+        if not self._old.issuperset(keys):
+            kept[number] = Entry(record=moved, active=entry.active)
+            return
+        group = groups[keys]
+        if entry.active:
+            group.append((number, moved))
 
     def _anchored(self, anchor: Anchor) -> Anchor:
         """Return an anchor at a node that stays, with the way there as it was reckoned."""
@@ -202,27 +202,29 @@ class Composition:
         variance_m2 = moved.sigma_m**2 + float(direction @ spread_m2 @ direction)
         return replace(moved, sigma_m=float(np.sqrt(variance_m2)))
 
-    def _is_old(self, record: ClosureRecord | RangeRecord) -> bool:
-        return record.origin.key in self._old and record.target.key in self._old
+    def _moved_fix(self, fix: AbsoluteRecord) -> AbsoluteRecord:
+        """Return a fix at a node that stays, as uncertain as the way to it makes it."""
+        apart_m2 = self._apart_m2.get(fix.anchor.key, np.zeros((2, 2)))
+        return replace(
+            fix,
+            anchor=self._anchored(fix.anchor),
+            covariance_m2=fix.covariance_m2 + apart_m2,
+        )
 
-    def _thinned(
-        self, closures: Mapping[tuple[int, int], Group[ClosureRecord]]
-    ) -> list[Group[ClosureRecord]]:
-        """Return what stays of the groups: their active closures that the estimate believes.
+    def _thinned(self, closures: Groups[ClosureRecord]) -> list[Group[ClosureRecord]]:
+        """Return what stays of the groups: the closures that the estimate believes.
 
         A group belongs to the newer of its two pieces; of each piece those with the oldest others
         stay, vague ones after all others. What lies within one piece goes.
         """
         by_piece: dict[int, list[tuple[float, float, Group[ClosureRecord]]]] = defaultdict(list)
         for (origin, target), group in closures.items():
-            believed = [item for item in group if item[1].active and self._is_true(item[2])]
+            believed = [(number, record) for number, record in group if self._is_true(record)]
             if origin == target or not believed:
                 continue
-            ends = sorted(
-                (anchor.time_s, anchor.key)
-                for anchor in (believed[0][2].origin, believed[0][2].target)
-            )
-            told = max(record.information for _, _, record in believed)
+            _, first = believed[0]
+            ends = sorted((anchor.time_s, anchor.key) for anchor in (first.origin, first.target))
+            told = max(record.information for _, record in believed)
             by_piece[ends[1][1]].append((told, ends[0][0], believed))
         thinned = []
         for groups in by_piece.values():
@@ -286,9 +288,8 @@ def _keep(
     new: list[Record],
 ) -> None:
     """Let one record of a piece, or of two, stay as it is; several become a new one."""
-    active = [item for item in group if item[1].active]
-    if len(active) == 1:
-        number, _, record = active[0]
+    if len(group) == 1:
+        [(number, record)] = group
         kept[number] = Entry(record=record, active=True)
-    elif active:
-        new.append(composed([record for _, _, record in active]))
+    elif group:
+        new.append(composed([record for _, record in group]))

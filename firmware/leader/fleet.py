@@ -83,25 +83,29 @@ class Fleet:
 
         It may not where its vehicle has begun too many boots within the hour.
         """
-        known = self._followers.get(header.vehicle)
-        if known is None or self._told(header, known) <= known.boot:
+        known = self._followers.setdefault(header.vehicle, _Vehicle(boot=header.boot_epoch))
+        boot = self.boot_of(header)
+        if boot <= known.boot:
             return True
-        is_admitted = self._note_boot(known, now_s)
-        if is_admitted:
-            self.boot_of(header)
-        return is_admitted
+        if not self._note_boot(known, now_s):
+            return False
+        known.boot = boot
+        known.jumped.clear()
+        self.counters["restarts"] += 1
+        return True
 
     def boot_of(self, header: Header) -> int:
-        """Return the boot of a frame; a late frame's may be earlier than the newest."""
-        known = self._followers.get(header.vehicle)
-        if known is None:
-            known = self._followers[header.vehicle] = _Vehicle(boot=header.boot_epoch)
-        boot = self._told(header, known)
-        if boot > known.boot:
-            known.boot = boot
-            known.jumped.clear()
-            self.counters["restarts"] += 1
-        return boot
+        """Return the boot that a frame of a known vehicle tells of.
+
+        A late frame's may be earlier than the newest.
+        """
+        newest = self._followers[header.vehicle].boot
+        ahead = (header.boot_epoch - newest) % BOOT_EPOCHS
+        earlier = newest + ahead - BOOT_EPOCHS
+        is_likely = ahead >= BOOT_EPOCHS // 2 or chain_of(header.vehicle, earlier) in self._tracks
+        if ahead and earlier >= 0 and is_likely and self._is_late(header, earlier):
+            return earlier
+        return newest + ahead
 
     def chain(self, header: Header) -> int:
         """Return the number of the chain that a frame's states belong to."""
@@ -219,15 +223,6 @@ class Fleet:
                 known.boot += BOOT_EPOCHS
                 self.counters["lasting_jumps"] += 1
         return None
-
-    def _told(self, header: Header, known: _Vehicle) -> int:
-        """Return the boot that a frame tells of, beside the newest that is known."""
-        ahead = (header.boot_epoch - known.boot) % BOOT_EPOCHS
-        earlier = known.boot + ahead - BOOT_EPOCHS
-        is_likely = ahead >= BOOT_EPOCHS // 2 or chain_of(header.vehicle, earlier) in self._tracks
-        if ahead and earlier >= 0 and is_likely and self._is_late(header, earlier):
-            return earlier
-        return known.boot + ahead
 
     def _note_boot(self, known: _Vehicle, now_s: float) -> bool:
         """Note that a vehicle begins another boot; return False where it may not."""

@@ -63,12 +63,10 @@ def test_restart_is_tied_to_the_old_chain_whenever_it_comes(last_s: int) -> None
     for boot, times_s in ((0, range(106, last_s, 4)), (1, range(last_s + 10, last_s + 70, 4))):
         for first_s in times_s:  # slices of four seconds, as the paper's frames carry them
             header = decode(trajectory(walked(4, 0.0), float(first_s))).header
-            leader._arrivals._receive_states(
-                dataclasses.replace(header, boot_epoch=boot),
-                float(first_s),
-                walked(4, 2.0 * first_s),
-                first_s + 44.0,
-            )
+            header = dataclasses.replace(header, boot_epoch=boot)
+            states, now_s = walked(4, 2.0 * first_s), first_s + 44.0
+            assert leader.fleet.admit(header, now_s)
+            leader._arrivals._receive_states(header, float(first_s), states, now_s)
     assert leader.status()["restarts"] == 1
     newest, graph = leader.fleet.newest_chain(1), leader.graph
     (tie,) = [e.record for e in graph._ledger.values() if isinstance(e.record, TieRecord)]
@@ -193,6 +191,7 @@ def test_lasting_jump_at_the_end_of_a_packet_silences_nobody() -> None:
     states = walked(40, 120.0)
     states[10:, 0] += 500.0
     header = decode(trajectory(walked(20, 0.0), 60.0)).header
+    assert leader.fleet.admit(header, 104.0)
     leader._arrivals._receive_states(header, 60.0, states, 104.0)
     assert leader.status()["lasting_jumps"] == 1
     assert leader.poll(111.0) is not None
@@ -241,6 +240,7 @@ def fleet_of(boots: int, end_s: int = 1200) -> tuple[Fleet, PoseGraph]:
         header = decode(trajectory(walked(4, 0.0), float(first_s))).header
         header = dataclasses.replace(header, boot_epoch=boot)
         states = walked(last_s - first_s, 2.0 * first_s)
+        assert fleet.admit(header, float(end_s))
         kept = fleet.receive_states(header, float(first_s), states, float(end_s))
         assert kept is not None
         fleet.extend(kept[0])

@@ -3,10 +3,16 @@
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from firmware.geometry import Array
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Values = TypeVar("Values", bound="DataclassInstance")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,23 +87,19 @@ class Submap:
 
 def joined(parts: Sequence[Submap]) -> Submap:
     """Return consecutive stretches of one vehicle's survey as one sub-map, numbered as the last."""
-    bins, tracks = [part.bins for part in parts], [part.track for part in parts]
+    bins = [part.bins for part in parts]
     return dataclasses.replace(
         parts[-1],
-        track=Track(**{f.name: _together(tracks, f.name) for f in dataclasses.fields(Track)}),
-        bins=BinnedSoundings(
-            cell_m=max(b.cell_m for b in bins),
-            **{
-                f.name: _together(bins, f.name)
-                for f in dataclasses.fields(BinnedSoundings)
-                if f.name != "cell_m"
-            },
-        ),
+        track=concatenated([part.track for part in parts]),
+        bins=concatenated(bins, cell_m=max(b.cell_m for b in bins)),
     )
 
 
-def _together(values: Sequence[object], name: str) -> Array:
-    return np.concatenate([getattr(value, name) for value in values])
+def concatenated(parts: Sequence[Values], **common: object) -> Values:
+    """Return dataclasses of arrays one after the other; fields that are no arrays are given."""
+    names = [f.name for f in dataclasses.fields(parts[0]) if f.name not in common]
+    arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return dataclasses.replace(parts[0], **arrays, **common)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,13 +13,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware.geometry import Array
 from firmware.leader.atlas import chain_of, vehicle_of
 from firmware.leader.pose_graph import PoseGraph
 from firmware.leader.range_windows import RangeWindows
 from firmware.leader.tracks import TrackBuffer
 from firmware.leader.trajectory import Trajectory
-from firmware.submaps import Track
+from firmware.submaps import Track, concatenated
 from protocol.packets import Header, usable_states
 from protocol.settings import Settings, setting
 from protocol.timestamps import from_quarters
@@ -159,21 +158,11 @@ class Fleet:
 
     def whole_track(self, vehicle: int) -> Track:
         """Return the tracks of all of a vehicle's boots, one after the other."""
-        parts = [self.track(chain) for chain in self._chains(vehicle)]
-        columns = [np.concatenate(part) for part in zip(*map(_columns, parts), strict=True)]
-        return Track(time_s=columns[0], north_m=columns[1], east_m=columns[2], yaw_rad=columns[3])
+        return concatenated([self.track(chain) for chain in self._chains(vehicle)])
 
     def whole_trajectory(self, vehicle: int) -> Trajectory:
         """Return the estimate over all of a vehicle's boots."""
-        parts = [self._graph.trajectory(chain) for chain in self._chains(vehicle)]
-        if len(parts) == 1:
-            return parts[0]
-        return Trajectory(
-            time_s=np.concatenate([p.time_s for p in parts]),
-            reckoned_m=np.concatenate([p.reckoned_m for p in parts]),
-            position_m=np.concatenate([p.position_m for p in parts]),
-            bias_mps=np.concatenate([p.bias_mps for p in parts]),
-        )
+        return concatenated([self._graph.trajectory(chain) for chain in self._chains(vehicle)])
 
     def chain_at(self, vehicle: int, time_s: float) -> int:
         """Return the chain of a vehicle that the time belongs to."""
@@ -244,7 +233,8 @@ class Fleet:
 
     def _begin(self, chain: int, track: Track) -> None:
         """Start a chain: a vehicle's first at its deployment, a later one where the last ended."""
-        start_m, time_s = _position(track, 0), float(track.time_s[0])
+        time_s = float(track.time_s[0])
+        start_m = track.position_at(time_s)
         chains = self._chains(vehicle_of(chain))
         earlier = [c for c in chains if self.track(c).time_s[0] < time_s]
         if not earlier:
@@ -266,11 +256,3 @@ class Fleet:
         self._graph.add_boot(
             chain, time_s, start_m, after=before, reached_m=reached_m, sigma_m=sigma_m
         )
-
-
-def _columns(track: Track) -> tuple[Array, Array, Array, Array]:
-    return track.time_s, track.north_m, track.east_m, track.yaw_rad
-
-
-def _position(track: Track, row: int) -> Array:
-    return np.array([track.north_m[row], track.east_m[row]])

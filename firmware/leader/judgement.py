@@ -27,7 +27,6 @@ from firmware.leader.consistency import (
     consistent_set,
 )
 from firmware.leader.map_vote import VoteSettings, VoteWindow, carried, vote
-from firmware.leader.matches import MatchingSettings
 from firmware.leader.nonconvexity import Doubt
 from firmware.leader.pairing import Calibrations, side_of
 from firmware.leader.pose_graph import PoseGraph
@@ -69,15 +68,9 @@ class JudgementSettings(Settings):
 class Judgement:
     """Decides on gated closures; keeps those that wait, bounded."""
 
-    def __init__(
-        self,
-        settings: JudgementSettings,
-        matching: MatchingSettings,
-        calibrations: Calibrations | None = None,
-    ) -> None:
+    def __init__(self, settings: JudgementSettings, calibrations: Calibrations) -> None:
         self.counters: Counter[str] = Counter()
-        self._settings = settings
-        self._calibrations = calibrations or Calibrations(matching)
+        self._settings, self._calibrations = settings, calibrations
         self._settled: frozenset[int] = frozenset()  # closures that the last doubt found false
         self._waiting: deque[Closure] = deque(maxlen=settings.waiting)
         self._hints: deque[int] = deque(maxlen=settings.hints)

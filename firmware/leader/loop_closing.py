@@ -37,7 +37,7 @@ class LoopClosing:
         self._graph, self._atlas, self._settings = graph, atlas, settings
         self._waiting: deque[Sheet] = deque(maxlen=_SHEETS_WAITING)
         self._calibrations = Calibrations(settings.matching)
-        self._judgement = Judgement(settings.judgement, settings.matching, self._calibrations)
+        self._judgement = Judgement(settings.judgement, self._calibrations)
         self._open = OpenPairs(settings.closures)
         self._sheets_judged = 0
         self._doubt: Doubt | None = None  # to go with the next matches

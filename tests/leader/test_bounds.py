@@ -16,6 +16,7 @@ from firmware.leader.judgement import Judgement, JudgementSettings
 from firmware.leader.ledger import Anchor
 from firmware.leader.match_jobs import MatchJob, SheetJobs
 from firmware.leader.matches import MatchingSettings, MatchOutcome, NoMatch
+from firmware.leader.pairing import Calibrations
 from firmware.leader.shelf import MemoryShelf, packed, unpacked
 from firmware.submaps import GriddedSubmap, Track
 
@@ -161,7 +162,7 @@ def test_corrections_decide_which_place_is_covered() -> None:
 
 
 def test_a_closure_whose_sub_map_was_dropped_meanwhile_is_asked_no_map() -> None:
-    judgement = Judgement(JudgementSettings(), MatchingSettings())
+    judgement = Judgement(JudgementSettings(), Calibrations(MatchingSettings()))
     closure = closure_at(900.0, None)
     closure.stage, closure.active, closure.predicted_sigma_m = Stage.GATED, False, 20.0
     judgement.consider([closure], Atlas(4), MagicMock())

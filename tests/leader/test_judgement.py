@@ -8,10 +8,12 @@ from firmware.leader.closures import Closure, Stage
 from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.judgement import Judgement, JudgementSettings
 from firmware.leader.matches import MatchingSettings
+from firmware.leader.pairing import Calibrations
 from firmware.leader.pose_graph import PoseGraph
 from firmware.submaps import Track
 
 HOURS, TIDE_S, TIDE_MPS = 5.0, 12.4 * 3600.0, 0.2
+UNCALIBRATED = Calibrations(MatchingSettings())
 
 
 def moored() -> tuple[PoseGraph, Track]:
@@ -59,7 +61,7 @@ def test_true_closures_vouch_for_each_other_hours_into_a_turning_tide() -> None:
             closure_between(graph, track, 600.0 + k, hour * 3600.0 + k, np.zeros(2))
             for k in (0.0, 240.0)
         ]
-        Judgement(JudgementSettings(), MatchingSettings()).consider(pair, Atlas(10), graph)
+        Judgement(JudgementSettings(), UNCALIBRATED).consider(pair, Atlas(10), graph)
         assert all(closure.active for closure in pair), hour
 
 
@@ -73,7 +75,7 @@ def test_closures_of_the_same_soundings_do_not_vouch_for_each_other() -> None:
         ]
         for closure in pair:
             closure.axis_deg = 0.0  # then the map beside it is not asked
-        Judgement(JudgementSettings(), MatchingSettings()).consider(pair, Atlas(10), graph)
+        Judgement(JudgementSettings(), UNCALIBRATED).consider(pair, Atlas(10), graph)
         assert [closure.active for closure in pair] == [believed, believed]
 
 
@@ -86,5 +88,5 @@ def test_closures_that_contradict_dead_reckoning_do_not() -> None:
     ]
     for closure in pair:
         closure.axis_deg = 0.0  # then the map beside it is not asked
-    Judgement(JudgementSettings(), MatchingSettings()).consider(pair, Atlas(10), graph)
+    Judgement(JudgementSettings(), UNCALIBRATED).consider(pair, Atlas(10), graph)
     assert not any(closure.active for closure in pair)

@@ -10,6 +10,7 @@ from firmware.leader.atlas import SheetId
 from firmware.leader.closures import Closure, Stage
 from firmware.leader.judgement import Judgement, JudgementSettings
 from firmware.leader.matches import MatchingSettings
+from firmware.leader.pairing import Calibrations
 from firmware.leader.pose_graph import PoseGraph
 from firmware.submaps import Track
 from tests.leader.test_pose_graph import close, started, walk
@@ -32,7 +33,7 @@ class Mission:
         rng = np.random.default_rng(self.seed)
         self.track, true_m = walk(rng, SECONDS, 0.3)
         self.graph = started(self.track)
-        self.judgement = Judgement(JudgementSettings(), MatchingSettings())
+        self.judgement = Judgement(JudgementSettings(), Calibrations(MatchingSettings()))
         self.closures: list[Closure] = []
         wrong_m = rng.normal(0.0, 1.0, 2)
         wrong_m *= self.wrong_m / np.hypot(*wrong_m)

@@ -303,7 +303,7 @@ def test_neighbouring_pairs_together_tell_less_than_two(
     (job,) = _looks(graph, 1e6)
     hint = Hint(shift_m=np.array([7.0, -4.0]), covariance_m2=0.1 * job.prior_covariance_m2)
     pairs = OpenPairs(dataclasses.replace(ClosureSettings(), hint_prior_m=0.0))
-    judgement = Judgement(JudgementSettings(), MatchingSettings())
+    judgement = Judgement(JudgementSettings(), Calibrations(MatchingSettings()))
     entered_m2 = []
     for k, apart_s in enumerate((0.0, 20.0, 40.0, 100.0)):
         target = dataclasses.replace(
@@ -325,7 +325,7 @@ def test_match_takes_the_place_of_the_hint(graph: PoseGraph) -> None:
     (job,) = _looks(graph, 1e6)
     hint = Hint(shift_m=np.array([7.0, -4.0]), covariance_m2=0.1 * job.prior_covariance_m2)
     pairs = OpenPairs(dataclasses.replace(ClosureSettings(), hint_prior_m=0.0))
-    judgement = Judgement(JudgementSettings(), MatchingSettings())
+    judgement = Judgement(JudgementSettings(), Calibrations(MatchingSettings()))
     pairs.keep_or_settle(job, dataclasses.replace(AMBIGUOUS, hint=hint), graph, judgement)
     number = pairs.hint(job.origin.id, job.target.id)
     assert graph.is_active(number)

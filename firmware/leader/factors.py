@@ -1,6 +1,6 @@
-"""Records of the ledger as factors of gtsam."""
+"""Records of the ledger as factors of gtsam, and estimates as its values."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import gtsam
 import numpy as np
@@ -43,6 +43,14 @@ def factor_of(  # noqa: PLR0911
             return _range(record, _robust(np.array([[record.sigma_m**2]]), robust_kernel))
         case AbsoluteRecord():
             return _absolute(record, _robust(record.covariance_m2, robust_kernel))
+
+
+def values_of(estimate: Mapping[int, Array]) -> gtsam.Values:
+    """Return the states of variables by their keys as gtsam's values."""
+    values = gtsam.Values()
+    for key, state in estimate.items():
+        values.insert(key, state)
+    return values
 
 
 def _robust(covariance: Array, robust_kernel: float) -> gtsam.noiseModel.Base:

@@ -16,7 +16,7 @@ import gtsam
 import numpy as np
 
 from firmware.geometry import Array
-from firmware.leader.factors import factor_of
+from firmware.leader.factors import factor_of, values_of
 from firmware.leader.ledger import ClosureRecord, Record
 
 _STEEPER = 1.4  # from round to round, as in the source
@@ -52,9 +52,7 @@ class Doubt:
     def _false(self) -> list[int]:
         certain = [factor_of(record, self.robust_kernel) for record in self.believed]
         weights = dict.fromkeys(self.doubted, 1.0)
-        values = gtsam.Values()
-        for key, state in self.estimate.items():
-            values.insert(key, state)
+        values = values_of(self.estimate)
         values = self._solved(certain, weights, values, self.robust_kernel, _FIRST_STEPS)
         squares = self._squares(values)
         if max(squares.values()) > self.reject_chi_square:

@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 
 from firmware.geometry import Array
-from firmware.leader.factors import factor_of
+from firmware.leader.factors import factor_of, values_of
 from firmware.leader.ledger import (
     Entry,
     OdometryRecord,
@@ -61,7 +61,7 @@ class Solver:
         return state | {"about": {key: about.atVector(key) for key in about.keys()}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        about = _values_of(state.pop("about"))
+        about = values_of(state.pop("about"))
         self.__dict__.update(state)
         self._changed, self._fresh, self._factors = set(), gtsam.Values(), {}
         self._rebuild(about)
@@ -102,7 +102,7 @@ class Solver:
     def restart(self, estimate: Mapping[int, Array]) -> None:
         """Build ISAM2 anew from a ledger that was changed at will, and an estimate of its keys."""
         self._factors.clear()
-        values = _values_of(estimate)
+        values = values_of(estimate)
         try:
             self._rebuild(values)
         except RuntimeError:
@@ -185,13 +185,6 @@ class Solver:
                 graph.push_back(self._factor(number))
                 entries.append(entry)
         return graph, entries
-
-
-def _values_of(estimate: Mapping[int, Array]) -> gtsam.Values:
-    values = gtsam.Values()
-    for key, vector in estimate.items():
-        values.insert(key, vector)
-    return values
 
 
 def _isam_of(

@@ -71,10 +71,7 @@ class Outlook:
     def propose(self) -> Proposal | None:
         """Return the manoeuvre that would help most, if one would."""
         try:
-            situation = situation_of(
-                self._fleet, self._estimate, self._atlas, self._settings, self._matching
-            )
-            return propose(situation, self._settings)
+            return propose(self._situation(), self._settings)
         except (EstimationError, np.linalg.LinAlgError):
             return None
         except Exception:
@@ -92,39 +89,32 @@ class Outlook:
             "undetermined_directions": seen.blind,
         }
 
+    def _situation(self) -> Situation:
+        """Return where everyone is and what is known of the ground in reach.
 
-def situation_of(
-    fleet: Fleet,
-    estimate: Estimate,
-    atlas: Atlas,
-    settings: ManoeuvreSettings,
-    matching: MatchingSettings,
-) -> Situation:
-    """Return where everyone is and what is known of the ground in reach.
-
-    Raises EstimationError if the estimate can say nothing.
-    """
-    vehicles = fleet.vehicles()
-    chains = [fleet.newest_chain(vehicle) for vehicle in vehicles]
-    positions_m = np.array([estimate.trajectory(chain).position_m[-1] for chain in chains])
-    velocities_mps = np.array([_velocity(fleet, estimate, chain) for chain in chains])
-    reach_m = float(np.hypot(*velocities_mps.T).max()) * settings.horizon_s
-    sheets, places_m = _in_reach(list(atlas), estimate, positions_m, reach_m)
-    anchors = [anchor_of(sheet, estimate) for sheet in sheets]
-    return Situation(
-        names=tuple(name_of(vehicle) for vehicle in vehicles),
-        positions_m=positions_m,
-        velocities_mps=velocities_mps,
-        ground=tuple(
-            Ground(
-                position_m=place_m,
-                information=_told(sheet.grid, matching, settings.closure_floor_m),
-            )
-            for sheet, place_m in zip(sheets, places_m, strict=True)
-        ),
-        joint=estimate.newest_with(chains, anchors),
-        wandering=estimate.wandering,
-    )
+        Raises EstimationError if the estimate can say nothing.
+        """
+        vehicles, estimate, settings = self._fleet.vehicles(), self._estimate, self._settings
+        chains = [self._fleet.newest_chain(vehicle) for vehicle in vehicles]
+        positions_m = np.array([estimate.trajectory(chain).position_m[-1] for chain in chains])
+        velocities_mps = np.array([_velocity(self._fleet, estimate, chain) for chain in chains])
+        reach_m = float(np.hypot(*velocities_mps.T).max()) * settings.horizon_s
+        sheets, places_m = _in_reach(list(self._atlas), estimate, positions_m, reach_m)
+        anchors = [anchor_of(sheet, estimate) for sheet in sheets]
+        return Situation(
+            names=tuple(name_of(vehicle) for vehicle in vehicles),
+            positions_m=positions_m,
+            velocities_mps=velocities_mps,
+            ground=tuple(
+                Ground(
+                    position_m=place_m,
+                    information=_told(sheet.grid, self._matching, settings.closure_floor_m),
+                )
+                for sheet, place_m in zip(sheets, places_m, strict=True)
+            ),
+            joint=estimate.newest_with(chains, anchors),
+            wandering=estimate.wandering,
+        )
 
 
 def _told(grid: GriddedSubmap, matching: MatchingSettings, floor_m: float) -> Array:

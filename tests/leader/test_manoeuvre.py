@@ -92,7 +92,7 @@ def test_remark_that_cannot_be_made_is_logged_and_raises_nothing(
         raise ValueError("a bug")
 
     leader = sailed(50.0)
-    for part in ("observe", "situation_of"):
+    for part in ("observe", "propose"):
         monkeypatch.setattr(outlook, part, fails)
     assert leader.outlook.observe(50.0) is None
     assert leader.outlook.propose() is None

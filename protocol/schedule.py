@@ -138,24 +138,6 @@ class Air:
         return 8.0 * self.answer_bytes / self.rate_bps
 
 
-def conflict_free_reach_m(settings: SlotSettings, air: Air) -> float:
-    """Return the distance up to which these slots cannot collide, whatever the geometry.
-
-    Within it a follower's frame has passed the leader before the leader answers and before the next
-    follower's frame, and the answer has passed all followers before any of them transmits.
-    """
-    slot_s = settings.follower_slot_s
-    starts_s = (
-        offset_s + turn * settings.leader_period_s
-        for offset_s in settings.leader_offsets_s
-        for turn in range(slot_s)  # after slot_s periods the two rasters repeat
-    )
-    guards_s = [slot_s - air.frame_s]
-    for phase_s in {start_s % slot_s for start_s in starts_s}:
-        guards_s += [phase_s - air.frame_s, slot_s - phase_s - air.answer_s]
-    return max(0.0, min(guards_s)) * air.sound_speed_mps
-
-
 def planned_slots(followers: int, reach_m: float, air: Air) -> SlotSettings:
     """Return the shortest slots of whole seconds that cannot collide within a distance.
 

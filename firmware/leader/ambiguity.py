@@ -232,21 +232,19 @@ def ridge_of(
 
 def mass_elsewhere(found: Posterior, winner_m: Array, radius_m: float) -> MassElsewhere:
     """Return the mass outside the winner's basin, and outside the line through it."""
-    north, east = found.north_m - winner_m[0], found.east_m - winner_m[1]
-    square = north[:, None] ** 2 + east[None, :] ** 2
-    inside = float(found.mass[square <= radius_m**2].sum())
-    along_n, along_e = north[:, None], east[None, :]
-    second = np.array(
-        [
-            [np.sum(found.mass * along_n**2), np.sum(found.mass * along_n * along_e)],
-            [np.sum(found.mass * along_n * along_e), np.sum(found.mass * along_e**2)],
-        ]
-    )
+    north = (found.north_m - winner_m[0])[:, None]
+    east = (found.east_m - winner_m[1])[None, :]
+    inside = found.mass[north**2 + east**2 <= radius_m**2]
+    crossed = np.sum(found.mass * north * east)
+    second = [
+        [np.sum(found.mass * north**2), crossed],
+        [crossed, np.sum(found.mass * east**2)],
+    ]
     _, vectors = np.linalg.eigh(second)
     across = vectors[:, 0]
-    off = np.abs(across[0] * along_n + across[1] * along_e)
+    off = np.abs(across[0] * north + across[1] * east)
     return MassElsewhere(
-        false_mass=1.0 - inside,
+        false_mass=1.0 - float(inside.sum()),
         axis_rad=float(np.arctan2(across[1], across[0]) % np.pi),
         false_mass_off_line=1.0 - float(found.mass[off <= radius_m].sum()),
     )

@@ -156,20 +156,17 @@ def _nearest(times_s: Sequence[float] | Array, time_s: float) -> int:
 
 def shared_walk(
     first: Chain, chain: Chain, begin_s: float, end_s: float, bias_walk_apart: float
-) -> list[SharedWalkRecord]:
-    """Return the record that a chain's bias changed as the first chain's did, if any.
+) -> SharedWalkRecord | None:
+    """Return the record that a chain's bias changed as the first chain's did.
 
-    There is none where one of the four nodes is missing.
+    There is none of the first chain itself, nor where one of the four nodes is missing.
     """
-    if chain is first:
-        return []
-    origins = first.key_at(begin_s), chain.key_at(begin_s)
-    targets = first.key_at(end_s), chain.key_at(end_s)
-    if origins[0] is None or origins[1] is None or targets[0] is None or targets[1] is None:
-        return []
-    sigma_mps = bias_walk_apart * float(np.sqrt(end_s - begin_s))
-    return [
-        SharedWalkRecord(
-            origins=(origins[0], origins[1]), targets=(targets[0], targets[1]), sigma_mps=sigma_mps
-        )
-    ]
+    keys = [c.key_at(time_s) for time_s in (begin_s, end_s) for c in (first, chain)]
+    nodes = [key for key in keys if key is not None]
+    if chain is first or len(nodes) < len(keys):
+        return None
+    return SharedWalkRecord(
+        origins=(nodes[0], nodes[1]),
+        targets=(nodes[2], nodes[3]),
+        sigma_mps=bias_walk_apart * float(np.sqrt(end_s - begin_s)),
+    )

@@ -302,8 +302,9 @@ class PoseGraph(Estimate):
 
     def _walk_alike(self, chain: Chain, begin_s: float, end_s: float) -> None:
         first = next(iter(self._chains.values()))
-        for tie in shared_walk(first, chain, begin_s, end_s, self.wandering.apart):
-            self._enter(tie)
+        alike = shared_walk(first, chain, begin_s, end_s, self.wandering.apart)
+        if alike is not None:
+            self._enter(alike)
 
     def _join_all(self) -> None:
         """Say anew of the nodes that are left how dead reckoning and the water join them."""

@@ -190,7 +190,7 @@ class RangeWindows:
             try:
                 here = graph.anchor(receiver[0], held.arrived_s, receiver[1])
                 there = graph.anchor(sender[0], held.sent_s, sender[1])
-                placed.append(_placed(held, here, there, sender[0], graph))
+                placed.append(_between(held, here, there, sender[0], graph))
             except EstimationError:
                 self.counters["ranges_unplaceable"] += 1
                 window.held.remove(held)
@@ -286,9 +286,10 @@ def _spread(placed: _PlacedRange, graph: PoseGraph) -> tuple[float, float]:
     return float(np.sqrt(max(along_m2, 1e-6))), bent_m
 
 
-def _placed(
+def _between(
     held: _HeldRange, here: Anchor, there: Anchor, sender: int, graph: PoseGraph
 ) -> _PlacedRange:
+    """Return a held range between the anchors of its ends, ours first."""
     clock_m, clock_sigma_m = graph.clock(sender, held.sent_s)
     between_m = graph.position(there) - graph.position(here)
     predicted_m = float(np.hypot(*between_m))

@@ -28,10 +28,7 @@ Rebuild = Callable[[SubmapTransfer], Reconstruction]
 
 
 class Arrivals:
-    """Packets of followers in; the fleet's tracks grow, sheets come out.
-
-    What is dropped is counted with the core's counters.
-    """
+    """Packets of followers in; the fleet's tracks grow, sheets come out."""
 
     def __init__(
         self,
@@ -41,9 +38,8 @@ class Arrivals:
         answers: Answers,
         settings: ReconstructionSettings,
         rebuild: Rebuild | None,
-        counters: Counter[str],
     ) -> None:
-        self._counters = counters
+        self.counters: Counter[str] = Counter()
         self._reassembler, self._fleet, self._graph = reassembler, fleet, graph
         self._answers, self._settings, self._rebuild = answers, settings, rebuild
         self._ranges_used_s: dict[int, float] = {}
@@ -76,12 +72,12 @@ class Arrivals:
         try:
             rebuilt = (self._rebuild or self._reconstruct)(transfer)
         except EstimationError:
-            self._counters["submaps_not_rebuilt"] += 1
+            self.counters["submaps_not_rebuilt"] += 1
             return
         if rebuilt.track.time_s.size == 0:
-            self._counters["submaps_without_track"] += 1
+            self.counters["submaps_without_track"] += 1
         elif not self._is_on_track(sheet_id.chain, rebuilt.track):
-            self._counters["submaps_off_track"] += 1
+            self.counters["submaps_off_track"] += 1
         else:
             lossy = not rebuilt.is_original
             yield sheet_of(sheet_id, rebuilt.track, rebuilt.grid, reconstructed=lossy)
@@ -111,7 +107,7 @@ class Arrivals:
         try:
             states = states_of_fragment(fragment)
         except EstimationError:
-            self._counters["fragments_without_track"] += 1
+            self.counters["fragments_without_track"] += 1
             return
         self._receive_states(header, first_s, states, now_s)
 

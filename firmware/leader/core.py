@@ -87,9 +87,8 @@ class LeaderCore:
             self._answers,
             settings.reconstruction,
             rebuild,
-            self.counters,
         )
-        self._closing = LoopClosing(self.graph, self.atlas, settings, self.counters)
+        self._closing = LoopClosing(self.graph, self.atlas, settings)
         self.outlook = Outlook(
             self.fleet, self.graph, self.atlas, settings.manoeuvre, settings.matching
         )
@@ -233,6 +232,7 @@ class LeaderCore:
         return {
             **self.counters,
             **self.fleet.counters,
+            **self._arrivals.counters,
             **self._answers.counters,
             **self._ranging.counters,
             **self._fixes.counters,
@@ -250,7 +250,6 @@ class LeaderCore:
             "submaps_dropped": self.atlas.dropped,
             "states_overflowed": self.fleet.overflowed,
             "graph_rebuilds": self.graph.rebuilds,
-            "open_submaps": self._closing.open_submaps,
             **self.outlook.status(),
         }
 

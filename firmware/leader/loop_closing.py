@@ -24,15 +24,10 @@ _SHEETS_WAITING = 16  # five minutes of own sub-maps
 
 
 class LoopClosing:
-    """Sheets that wait for their matches, and what became of those that had theirs.
+    """Sheets that wait for their matches, and what became of those that had theirs."""
 
-    What is dropped is counted with the core's counters.
-    """
-
-    def __init__(
-        self, graph: PoseGraph, atlas: Atlas, settings: LeaderSettings, counters: Counter[str]
-    ) -> None:
-        self._counters = counters
+    def __init__(self, graph: PoseGraph, atlas: Atlas, settings: LeaderSettings) -> None:
+        self._counters: Counter[str] = Counter()
         self.is_matching = False  # jobs are out, and their outcomes have not come yet
         self._graph, self._atlas, self._settings = graph, atlas, settings
         self._waiting: deque[Sheet] = deque(maxlen=_SHEETS_WAITING)
@@ -130,11 +125,11 @@ class LoopClosing:
         yield from map(verdict_of, self._closures)
 
     def status(self) -> dict[str, int]:
-        """Return the counters of judgement, of open pairs, and of verdicts that found no room."""
-        verdicts = {"verdicts_overwritten": self._settled.overwritten}
-        return {**self._judgement.counters, **self._open.counters, **verdicts}
-
-    @property
-    def open_submaps(self) -> int:
-        """How many sub-maps have open pairs."""
-        return len(self._open)
+        """Return every counter, those of judgement and of open pairs among them."""
+        return {
+            **self._counters,
+            **self._judgement.counters,
+            **self._open.counters,
+            "verdicts_overwritten": self._settled.overwritten,
+            "open_submaps": len(self._open),
+        }

@@ -1,7 +1,6 @@
 """A pair that a match left open is looked at again once its offset is known much better."""
 
 import dataclasses
-from collections import Counter
 from unittest.mock import MagicMock
 
 import numpy as np
@@ -250,8 +249,7 @@ def test_a_second_look_that_raises_takes_nothing_else_along(
 ) -> None:
     """As where what a pair has told is all that is known of it."""
     first, second, third, fourth = _sheets(atlas)
-    counters = Counter[str]()
-    closing = LoopClosing(graph, atlas, LeaderSettings(), counters)
+    closing = LoopClosing(graph, atlas, LeaderSettings())
     for target in (second, third):
         closing._open.note(_job(first, target, 1e6), AMBIGUOUS)
     closing.add(fourth)
@@ -274,7 +272,7 @@ def test_offsets_that_raise_leave_a_sheet_its_first_looks(
     atlas: Atlas, graph: PoseGraph, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first, second, third, _ = _sheets(atlas)
-    closing = LoopClosing(graph, atlas, LeaderSettings(), Counter[str]())
+    closing = LoopClosing(graph, atlas, LeaderSettings())
     closing._open.note(_job(first, second, 1e6), AMBIGUOUS)
     closing.add(third)
     monkeypatch.setattr(open_pairs, "offsets_of", MagicMock(side_effect=ValueError("no such row")))
@@ -285,14 +283,13 @@ def test_offsets_that_raise_leave_a_sheet_its_first_looks(
 def test_first_looks_that_raise_leave_a_sheet_its_second_ones(
     atlas: Atlas, graph: PoseGraph, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    counters = Counter[str]()
-    closing = LoopClosing(graph, atlas, LeaderSettings(), counters)
+    closing = LoopClosing(graph, atlas, LeaderSettings())
     closing.add(_sheets(atlas)[0])
     monkeypatch.setattr(loop_closing, "jobs_for", MagicMock(side_effect=ValueError("no such grid")))
     batch = closing.next_jobs()
     assert batch is not None
     assert batch.jobs == ()
-    assert counters["submaps_unmatched"] == 1
+    assert closing.status()["submaps_unmatched"] == 1
 
 
 @pytest.mark.parametrize("outcome", [AMBIGUOUS, UNSETTLED])

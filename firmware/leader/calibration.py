@@ -117,13 +117,10 @@ def _evidence_of(
     overlap: Overlap, noise: NoiseModel, settings: CalibrationSettings, known: Array
 ) -> _Evidence | None:
     """Return the information that an overlap adds once shift and offset are marginalised."""
-    layers = [
-        prepare(_pure(overlap.reference, overlap.reference_swath), reconstructed=False),
-        prepare(_pure(overlap.query, overlap.query_swath), reconstructed=False),
-    ]
-    if layers[0] is None or layers[1] is None:
+    reference = prepare(_pure(overlap.reference, overlap.reference_swath), reconstructed=False)
+    query = prepare(_pure(overlap.query, overlap.query_swath), reconstructed=False)
+    if reference is None or query is None:
         return None
-    reference, query = layers[0], layers[1]
     fields = fields_of(reference, _SMOOTHING_CELLS), fields_of(query, _SMOOTHING_CELLS)
     tracks = (
         _basis(overlap.reference_swath, overlap.reference, reference.grid),
@@ -131,7 +128,6 @@ def _evidence_of(
     )
     inverse = np.linalg.inv(overlap.covariance_m2)
     shift = np.array(overlap.shift_m, dtype=np.float64)
-    system = None
     for _ in range(_ITERATIONS):
         field = align(reference, query, fields, shift, noise)
         at = land(reference.grid, query.grid, shift)
@@ -145,9 +141,10 @@ def _evidence_of(
         shift = shift - limited(unknowns[:2])
         if np.hypot(*unknowns[:2]) < SETTLED_M:
             break
-    if system is None or not system.misfit(system.solved(known)) <= settings.misfit_limit:
+    misfit = system.misfit(unknowns)
+    if not misfit <= settings.misfit_limit:
         return None
-    return system.evidence(max(system.misfit(system.solved(known)), 1.0))
+    return system.evidence(max(misfit, 1.0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -116,8 +116,8 @@ def _search(
     best = int(np.argmax(scores))
     found = ambiguity.posterior(surface, evidence, prior, null_share)
     least = float(surface.misfit.min())  # on the lattice, beside it
-    ridge = surface, ambiguity.tolerated_misfit(least, independent)
-    return _decide(candidates[best], refined[best], found, prior, problem, ridge)
+    tolerated = ambiguity.tolerated_misfit(least, independent)
+    return _decide(candidates[best], refined[best], found, prior, problem, surface, tolerated)
 
 
 def _evidence(surface: ErrorSurface, relief: ambiguity.Relief) -> Array:
@@ -215,11 +215,12 @@ def _decide(
     found: ambiguity.Posterior,
     prior: Prior,
     problem: PairProblem,
-    ridge: tuple[ErrorSurface, float],
+    surface: ErrorSurface,
+    tolerated: float,
 ) -> MatchOutcome:
     """Return the winner as a closure in the plane or along one axis, or the gate it failed.
 
-    ridge is the screened surface, and the largest misfit that still counts as a fit.
+    tolerated is the largest misfit of the screened surface that still counts as a fit.
 
     Where the mass is certain though neither the slopes nor the prior can be, chance has chosen
     among the repetitions of a pattern: such a pair counts as ambiguous.
@@ -251,7 +252,7 @@ def _decide(
     else:
         return _none(NoMatch.AMBIGUOUS)
     turned_rad = problem.sigmas.strain_m / winner.field.extent_m
-    line = ambiguity.ridge_of(*ridge, prior, refined.shift_m, axis, turned_rad)
+    line = ambiguity.ridge_of(surface, tolerated, prior, refined.shift_m, axis, turned_rad)
     axis, across = line.axis, np.array([-line.axis[1], line.axis[0]])
     slide_m2 = ambiguity.PRIOR_DOUBTED**2 * float(across @ prior.covariance_m2 @ across)
     along = float(axis @ covariance @ axis) + line.strayed_m2 + line.sigma_rad**2 * slide_m2

@@ -126,7 +126,7 @@ def jobs_for(
     is taken out of all. Raises EstimationError if the sheet itself hangs on no node.
     """
     chosen = _worth_trying(_ranked(sheet, atlas, estimate, settings), settings)
-    return _jobs(sheet, chosen, estimate, settings, calibrations)
+    return _jobs(sheet, chosen, estimate, settings, calibrations, learn=True)
 
 
 def jobs_again(
@@ -157,6 +157,7 @@ def jobs_again(
         estimate,
         settings,
         calibrations,
+        learn=False,
         have_hints={known.origin.id for known, _, hint in partners if hint is not None},
     )
 
@@ -224,11 +225,12 @@ def _jobs(
     settings: ClosureSettings,
     calibrations: Calibrations,
     *,
-    have_hints: Set[SheetId] | None = None,
+    learn: bool,
+    have_hints: Set[SheetId] = frozenset(),
 ) -> list[MatchJob]:
     """Return the matches of a sheet with others, given its offsets from them.
 
-    Pairs looked at for the second time come with have_hints: those of which no hint is asked.
+    With `learn` the pairs teach the calibrations first. No hint is asked of those that have one.
     """
     if not chosen:
         return []
@@ -236,7 +238,7 @@ def _jobs(
     pairs = []
     for offset in chosen:
         origin = side_of(offset.origin, estimate.trajectory(offset.origin.id.chain))
-        if have_hints is None:
+        if learn:
             calibrations.learn(origin, target, offset.shift_m, offset.covariance_m2)
         pairs.append((origin, offset))
     grid = calibrations.level(target)
@@ -255,8 +257,7 @@ def _jobs(
                 calibrations.sigmas_of(origin, target, offset.shift_m), origin, target, offset
             ),
             drifts=offset.drifts,
-            hinted=offset.sigma_m >= settings.hint_prior_m
-            and origin.sheet.id not in (have_hints or ()),
+            hinted=offset.sigma_m >= settings.hint_prior_m and origin.sheet.id not in have_hints,
             looks=(calibrations.look_of(origin), calibrations.look_of(target)),
         )
         for origin, offset in pairs

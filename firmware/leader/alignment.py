@@ -19,7 +19,10 @@ _LEAST_CELLS = 12  # fewer cells than unknowns determine nothing
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NoiseModel:
-    """Standard deviations that the fit assumes; all may be zero but cell_sigma_m."""
+    """Standard deviations that the fit assumes; all may be zero but cell_sigma_m.
+
+    correlated_share is the share of a cell's variance that is alike within correlation_m.
+    """
 
     cell_sigma_m: float
     position_sigma_m: float
@@ -45,7 +48,7 @@ class Span:
 class Aligned:
     """Fields of the overlap at one shift, (R, C) on the query's lattice, zero outside."""
 
-    shift_m: Array
+    shift_m: Array  # (2,) added to the query's coordinates
     cell_m: float
     centre_m: Array  # (2,) of the overlap, in the reference's coordinates
     both: Array

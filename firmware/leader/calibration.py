@@ -56,7 +56,7 @@ class CalibrationSettings(Settings):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Overlap:
-    """Two passes over the same ground; the shift's prior is the graph's.
+    """Two passes over the same ground; the shift's prior, (2,) and (2, 2), is the graph's.
 
     A side of a vehicle other than the one being calibrated comes levelled and without a swath.
     """

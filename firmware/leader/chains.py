@@ -32,7 +32,7 @@ class Chain:
     parameters: int
     clock: int | None = None
     times_s: list[float] = field(default_factory=list)
-    reckoned_m: list[Array] = field(default_factory=list)
+    reckoned_m: list[Array] = field(default_factory=list)  # (2,) each
     keys: list[int] = field(default_factory=list)
     added: int = 0
     shape: Trajectory | None = None

@@ -40,7 +40,10 @@ class ConsistencySettings(Settings):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CandidateClosure:
-    """A closure as measured: position of `target` minus position of `origin` (2,)."""
+    """A closure as measured: position of `target` minus position of `origin` (2,).
+
+    Both are nodes as the odometry numbers them; the covariance is (2, 2).
+    """
 
     origin: int
     target: int

@@ -14,7 +14,7 @@ from firmware.leader.refinement import solve
 class Refined:
     """The optimum near one candidate.
 
-    covariance_m2 (2, 2) is of the shift, a kilometre along a direction without any information;
+    covariance_m2 (2, 2) is of the shift (2,), a kilometre along a direction without information;
     walk_m2 is to be added to each axis for the random walk of dead reckoning while the overlap was
     measured. variance_m2 is the predicted mean variance of a cell's difference. centre_m (2,) is
     the overlap's middle on the reference.
@@ -76,8 +76,7 @@ def _sandwich(field: Aligned, columns: Array, prior: Array, score: Array) -> Arr
     inverse = np.linalg.inv(h)
     covariance = inverse @ b @ inverse.T
     known = int(usable.sum())
-    local = np.full(2, 1e6)  # a kilometre: nothing is known in that direction
-    spread = np.diag(local)
+    spread = 1e6 * np.eye(2)  # a kilometre: nothing is known in that direction
     spread[np.ix_(usable, usable)] = covariance[:known, :known]
     result = vectors @ spread @ vectors.T
     return np.asarray(0.5 * (result + result.T))

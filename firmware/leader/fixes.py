@@ -97,6 +97,10 @@ class Fixes:
         )
 
     def _entered(self, time_s: float, fix: Fix, fleet: Fleet, graph: PoseGraph) -> str:
+        """Enter a fix that its gate lets pass; return the counter of what became of it.
+
+        Raises EstimationError where the graph cannot tell.
+        """
         chain = fleet.chain_at(fix.vehicle, time_s)
         fleet.extend(chain)
         anchor = graph.anchor(chain, time_s, fleet.track(chain))

@@ -25,7 +25,11 @@ LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatchJob:
-    """Everything one match needs, so that it can run beside the loop."""
+    """Everything one match needs, so that it can run beside the loop.
+
+    Of the grids a drift (2,) was taken about the times of their sheets. The prior, (2,) and (2, 2),
+    is that of the shift to add to the target's grid. looks are those of origin and target.
+    """
 
     origin: Sheet
     target: Sheet

@@ -59,7 +59,7 @@ def match(
     window that the prior implies, the best minima are refined below the cell, and the winner has
     to pass the threshold, carry evidence against unrelated seabed and leave little posterior mass
     elsewhere. A pair that fails leaves a hint, if one is asked for; then every shift is judged with
-    the drifts that it implies.
+    the drifts that it implies. The prior is that of the shift: mean (2,) and covariance (2, 2).
 
     Raises
     ------

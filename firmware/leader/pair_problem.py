@@ -32,7 +32,12 @@ _RESAMPLED_CELLS = 3.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairProblem:
-    """Two layers with their share of the noise, and all that stays the same while they match."""
+    """Two layers with their share of the noise, and all that stays the same while they match.
+
+    The variance of a difference is white_m2, each cell's own, and shared_m2, which neighbours in a
+    reconstruction have in common. slope2 is the mean squared slope, each axis. For ridge_cells see
+    `error_surface`.
+    """
 
     reference: Layer
     query: Layer

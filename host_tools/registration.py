@@ -19,9 +19,13 @@ REFINEMENTS = 3
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RegistrationError:
-    """The paper's registration error: absolute differences of depth, cell by cell."""
+    """The paper's registration error: absolute differences of depth, cell by cell.
+
+    mapped_share says how much of the truth map the map holds; what it lacks has no difference.
+    """
 
     cells: int
+    mapped_share: float
     mean_m: float
     median_m: float
     p95_m: float
@@ -48,13 +52,21 @@ def registration_error(depth_m: Array, truth_m: Array) -> RegistrationError:
     """Return the differences of two maps (R, C) over the cells that both hold."""
     difference_m = np.abs(depth_m - truth_m)
     difference_m = difference_m[np.isfinite(difference_m)]
+    surveyed = np.count_nonzero(np.isfinite(truth_m))
     if difference_m.size == 0:
         nan = float("nan")
         return RegistrationError(
-            cells=0, mean_m=nan, median_m=nan, p95_m=nan, share_under_half_m=nan, share_under_1m=nan
+            cells=0,
+            mapped_share=0.0 if surveyed else nan,
+            mean_m=nan,
+            median_m=nan,
+            p95_m=nan,
+            share_under_half_m=nan,
+            share_under_1m=nan,
         )
     return RegistrationError(
         cells=int(difference_m.size),
+        mapped_share=difference_m.size / surveyed,
         mean_m=float(difference_m.mean()),
         median_m=float(np.median(difference_m)),
         p95_m=float(np.percentile(difference_m, 95)),

@@ -90,7 +90,8 @@ def outcome_lines(evaluation: Evaluation) -> list[str]:
         )
     error = evaluation.registration
     lines.append(
-        f"map against truth-navigated map: mean {error.mean_m:.3f} m, "
+        f"map against truth-navigated map, {error.mapped_share:.1%} of it: "
+        f"mean {error.mean_m:.3f} m, "
         f"median {error.median_m:.3f} m, {error.share_under_1m:.1%} under 1 m; "
         f"{_shifts(evaluation.tiles)}"
     )

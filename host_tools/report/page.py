@@ -126,7 +126,8 @@ def _map_text(evaluation: Evaluation) -> str:
     return (
         f"<p>Against the map of the same soundings placed by true navigation: mean "
         f"{error.mean_m:.3f} m, median {error.median_m:.3f} m, {error.share_under_half_m:.1%} "
-        f"under 0.5 m, {error.share_under_1m:.1%} under 1 m ({error.cells} cells). "
+        f"under 0.5 m, {error.share_under_1m:.1%} under 1 m ({error.cells} cells, "
+        f"{error.mapped_share:.1%} of that map). "
         f"Horizontal shift of {tiles.tiles} tiles of 100 m{spread}; {tiles.far_tiles} more are "
         f"{SEARCH_M:.0f} m off or farther, {tiles.flat_tiles} too flat to say.</p>"
     )

@@ -179,4 +179,5 @@ def test_registration_error_counts_cells_that_both_maps_hold() -> None:
     depth_m[0] = np.nan
     error = registration_error(depth_m, truth_m)
     assert error.cells == 90
+    assert error.mapped_share == 0.9
     assert error.share_under_1m == pytest.approx(40 / 90, abs=0.02)

@@ -38,7 +38,8 @@ class TileShifts:
     """Horizontal shifts of tiles registered on the truth map.
 
     Neither flat tiles, which cannot say theirs, nor those that fit best at `SEARCH_M` or beyond,
-    where the search ends, are among the tiles that median and 95 % are of.
+    where the search ends, or nowhere on the truth map, are among the tiles that median and 95 % are
+    of.
     """
 
     tiles: int
@@ -135,8 +136,8 @@ class _Tile:
 
     def best_shift(self) -> Array | None:
         """Return the shift (2,) north, east that the tile is off by, or None for a flat tile."""
-        here = self._residual(np.zeros(2))
-        if here is None or not self._is_telling():
+        overlaps = self._residual(np.zeros(2)) is not None
+        if overlaps and not self._is_telling():
             return None
         step_m = max(float(self._cell_m.min()), SEARCH_M / 10.0)
         centre_m, best_m = np.zeros(2), np.zeros(2)

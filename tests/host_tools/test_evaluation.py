@@ -167,6 +167,13 @@ def test_tiles_farther_off_than_is_searched_are_counted_apart() -> None:
     assert np.isnan(tiles.median_m)
 
 
+def test_tiles_that_lie_beside_the_truth_map_are_far_off_not_flat() -> None:
+    truth_m, depth_m = relief(), relief()
+    truth_m[60:], depth_m[:60] = np.nan, np.nan
+    tiles = tile_shifts(depth_m, truth_m, 5.0, 5.0)
+    assert (tiles.tiles, tiles.flat_tiles, tiles.far_tiles) == (0, 0, 18)
+
+
 def test_tiles_of_a_flat_or_tilted_plane_do_not_claim_a_shift() -> None:
     plane_m = 50 + 0.05 * np.add.outer(np.arange(100.0), np.arange(100.0))
     tiles = tile_shifts(plane_m, plane_m, 5.0, 5.0)

@@ -29,10 +29,10 @@ FILL_M = 1.5  # half the diagonal of the 2 m cells that soundings are kept in
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrajectoryErrors:
-    """Unaligned horizontal errors over the whole mission.
+    """Unaligned horizontal errors over the whole mission, or the part of it that is named.
 
     share_of_dead_reckoning is mean over mean; percent_of_distance is the mean error relative to
-    the distance travelled.
+    the distance travelled meanwhile.
     """
 
     mean_m: float
@@ -122,7 +122,7 @@ def _position_m2(result: MissionResult) -> Array:
 def vehicle_errors(vehicle: VehicleResult, survey_s: float) -> VehicleErrors:
     """Return the errors of one vehicle's estimates."""
     truth_m = np.stack([vehicle.truth.north_m, vehicle.truth.east_m], axis=1)
-    distance_m = float(np.hypot(*np.diff(truth_m, axis=0).T).sum())
+    sailed_m = np.hypot(*np.diff(truth_m, axis=0, prepend=truth_m[:1]).T)
     reckoned_m = np.hypot(*(vehicle.dead_reckoning_m - truth_m).T)
     during = vehicle.truth.time_s <= survey_s
 
@@ -135,11 +135,11 @@ def vehicle_errors(vehicle: VehicleResult, survey_s: float) -> VehicleErrors:
             (estimate_m - truth_m)[used],
             None if covariance_m2 is None else covariance_m2[used],
             reckoned_m[used],
-            distance_m,
+            float(sailed_m[used].sum()),
         )
 
     return VehicleErrors(
-        distance_m=distance_m,
+        distance_m=float(sailed_m.sum()),
         live=errors(vehicle.live_m, vehicle.live_covariance_m2),
         final=errors(vehicle.final_m, vehicle.final_covariance_m2),
         dead_reckoning=errors(vehicle.dead_reckoning_m, None),

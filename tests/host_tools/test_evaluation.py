@@ -60,6 +60,12 @@ def test_errors_are_unaligned_metres_and_shares_of_dead_reckoning() -> None:
     assert errors.live.nees is None
 
 
+def test_errors_of_the_survey_are_relative_to_the_distance_of_the_survey() -> None:
+    errors = vehicle_errors(vehicle_result((3.0, 4.0), (0.0, 1.0)), survey_s=50.0)
+    assert errors.distance_m == pytest.approx(200.0)
+    assert errors.live_during_survey.percent_of_distance == pytest.approx(5.0)
+
+
 def test_nees_of_honest_covariances_is_two() -> None:
     rng = np.random.default_rng(1)
     covariance_m2 = np.array([[4.0, 1.0], [1.0, 2.0]])

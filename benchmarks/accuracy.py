@@ -24,10 +24,12 @@ from host_tools.commands import (
     status_of,
 )
 from host_tools.evaluation import Evaluation, JudgedClosure, evaluate
+from host_tools.registration import SEARCH_M
 from host_tools.simulate import simulate
 
 Figures = dict[str, float]
 ACTIVE, FALSE = "closures active", "false among active"
+FAR = f"tiles {SEARCH_M:.0f} m off or more, not in these"
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,8 +60,10 @@ def figures(evaluation: Evaluation, real_time: float) -> Figures:
         "map error, median": registration.median_m,
         "map under 0.5 m": 100 * registration.share_under_half_m,
         "map under 1 m": 100 * registration.share_under_1m,
+        "map, share of the truth map": 100 * registration.mapped_share,
         "tile shift, median": tiles.median_m,
         "tile shift, 95 %": tiles.p95_m,
+        FAR: float(tiles.far_tiles),
         "closures detected": float(len(evaluation.closures)),
         "valid among detected": _valid(list(evaluation.closures)),
         ACTIVE: float(len(active)),
@@ -75,6 +79,8 @@ def _valid(closures: list[JudgedClosure]) -> float:
 
 _UNITS: tuple[tuple[str, str, bool], ...] = (
     ("share of dead reckoning", "%", True),
+    ("share of the truth map", "%", False),
+    ("tiles", "", True),
     ("NEES", "", True),
     ("under", "%", False),
     ("valid", "%", False),
@@ -91,7 +97,7 @@ def _row(name: str) -> _Row:
 
 
 def table(runs: list[Figures]) -> list[str]:
-    """Return a line a figure: median and worst over the runs."""
+    """Return a line a figure: median and worst over the runs that have it."""
     lines = [f"{'':<42} {'median':>9} {'worst':>9}"]
     for name in runs[0]:
         row, values = _row(name), np.array([run[name] for run in runs])
@@ -99,7 +105,9 @@ def table(runs: list[Figures]) -> list[str]:
         if np.isnan(values).all():
             lines.append(f"{name:<42} {'-':>9} {'-':>9}")
             continue
-        lines.append(f"{name:<42} {np.nanmedian(values):9.2f} {worst(values):9.2f} {row.unit}")
+        told = np.count_nonzero(np.isfinite(values))
+        of = f" ({told} of {len(runs)} seeds)" if told < len(runs) else ""
+        lines.append(f"{name:<42} {np.nanmedian(values):9.2f} {worst(values):9.2f} {row.unit}{of}")
     return lines
 
 

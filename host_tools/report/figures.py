@@ -36,9 +36,19 @@ def _figure(width: float, height: float, columns: int = 1) -> tuple[Figure, list
     return figure, list(axes)
 
 
+def _panels(count: int, height: float) -> tuple[Figure, list[Axes]]:
+    """Return panels, two a row: more would be too small to read on the page."""
+    columns, rows = min(count, 2), -(-count // 2)
+    figure = Figure(figsize=(6.0 * columns, height * rows), layout="constrained")
+    axes = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for spare in axes[count:]:
+        spare.remove()
+    return figure, axes[:count]
+
+
 def trajectories(result: MissionResult) -> Figure:
     """Return true, dead-reckoned, live and final tracks, one panel a vehicle."""
-    figure, panels = _figure(6.0 * len(result.vehicles), 5.6, len(result.vehicles))
+    figure, panels = _panels(len(result.vehicles), 5.6)
     for axes, vehicle in zip(panels, result.vehicles, strict=True):
         tracks = (
             ("dead reckoning", vehicle.dead_reckoning_m, 1.2),
@@ -61,7 +71,7 @@ def trajectories(result: MissionResult) -> Figure:
 
 def errors_over_time(result: MissionResult) -> Figure:
     """Return horizontal errors of dead reckoning, live and final, with the stated 2 sigma."""
-    figure, panels = _figure(6.0 * len(result.vehicles), 3.8, len(result.vehicles))
+    figure, panels = _panels(len(result.vehicles), 3.8)
     for axes, vehicle in zip(panels, result.vehicles, strict=True):
         truth_m = np.stack([vehicle.truth.north_m, vehicle.truth.east_m], axis=1)
         minutes = vehicle.truth.time_s / 60.0
@@ -123,8 +133,11 @@ def maps(result: MissionResult, evaluation: Evaluation) -> Figure:
     shown = panels[1].imshow(
         difference_m, origin="lower", extent=extent, cmap="RdBu", vmin=-1.0, vmax=1.0
     )
-    figure.colorbar(shown, ax=panels[1], label="map less truth map (m)", shrink=0.8)
-    panels[1].set_title("registration error")
+    figure.colorbar(
+        shown, ax=panels[1], label="depth of map less truth map (m)", shrink=0.8, extend="both"
+    )
+    panels[1].set_title("registration error (grey: not in both maps)")
+    panels[1].set_facecolor("#c8c8c8")  # no error is nearly white
     for axes in panels:
         axes.set(xlabel="east (m)", ylabel="north (m)")
     return figure
@@ -191,7 +204,7 @@ def _strip(axes: Axes, closures: Sequence[JudgedClosure]) -> None:
 def link(deliveries: Sequence[Delivery], duration_s: float) -> Figure:
     """Return the fate of frames over time, one panel for each receiver."""
     receivers = sorted({delivery.destination for delivery in deliveries}) or [0]
-    figure, panels = _figure(6.0 * len(receivers), 3.4, len(receivers))
+    figure, panels = _panels(len(receivers), 3.6)
     width_s = max(60.0, duration_s / 60.0)
     edges_s = np.arange(0.0, duration_s + width_s, width_s)
     for axes, receiver in zip(panels, receivers, strict=True):
@@ -211,9 +224,10 @@ def link(deliveries: Sequence[Delivery], duration_s: float) -> Figure:
                 label=f"{fate}: {len(times_s)}",
             )
             bottom += count
-        name = "leader" if receiver == 0 else f"follower {receiver}"
-        axes.set(title=f"frames at the {name}", xlabel="time (min)")
+        name = "the leader" if receiver == 0 else f"follower {receiver}"
+        axes.set(title=f"frames at {name}", xlabel="time (min)")
         axes.set_ylabel(f"frames in {width_s / 60.0:.3g} min")
         if bottom.any():
-            axes.legend(loc="lower right", fontsize=8)
+            axes.set_ylim(0.0, 1.05 * bottom.max())
+            axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=4, fontsize=8)
     return figure

@@ -18,7 +18,7 @@ from host_tools.evaluation import (
 from host_tools.mapping import DepthMap
 from host_tools.registration import TileShifts
 from host_tools.report import write_report
-from host_tools.report.figures import maps
+from host_tools.report.figures import link, maps
 from host_tools.results import MissionResult, SoundingPatch, VehicleResult
 from host_tools.scenario import ScenarioSettings, named_scenario
 from host_tools.simulate import outcome_lines
@@ -247,6 +247,16 @@ def test_report_is_one_file_that_needs_no_other(mission: MissionResult, tmp_path
     assert "rotation about the range is unobservable" in page
     assert "http" not in page.replace("http-equiv", "")
     assert not re.search(r"<(script|link)\b", page)
+
+
+def test_panels_of_a_fleet_are_no_wider_than_the_page() -> None:
+    deliveries = [dataclasses.replace(delivery(0.0), destination=to) for to in range(5)]
+    figure = link(deliveries, 600.0)
+    assert figure.get_size_inches().tolist() == pytest.approx([12.0, 10.8])
+    assert [axes.get_title() for axes in figure.axes][:2] == [
+        "frames at the leader",
+        "frames at follower 1",
+    ]
 
 
 @pytest.mark.parametrize(

@@ -33,6 +33,7 @@ from firmware.vehicle_core import VehicleCore
 LOG = logging.getLogger(__name__)
 _NEVER_S = -float("inf")
 _REPEATED_S = 5.0  # before the journal's end; a commit a second leaves less to be repeated
+_STRAY_S = 60.0  # a stamp this far from the sensor's last one and from the clock is wrong
 _HEARD_AGAIN = 256  # frames that a modem may hand over a second time: its own cap of events
 
 
@@ -62,7 +63,7 @@ class Recorder:
         """Record navigation; None for what the journal already holds."""
         if self._is_known(odometry.time_s, self.last_odometry_s):
             return None
-        self.last_odometry_s = _end_s(odometry.time_s, self.last_odometry_s)
+        self.last_odometry_s = self._end_s(odometry.time_s, self.last_odometry_s)
         self.journal.append(Kind.ODOMETRY, from_odometry(odometry))
         return odometry
 
@@ -70,7 +71,7 @@ class Recorder:
         """Record a ping and return it as a replay will see it; None for a known one."""
         if self._is_known(ping.time_s, self._last_ping_s):
             return None
-        self._last_ping_s = _end_s(ping.time_s, self._last_ping_s)
+        self._last_ping_s = self._end_s(ping.time_s, self._last_ping_s)
         fan, body = fan_of(ping), from_ping(ping)
         if fan != self._fan:
             self._fan = fan
@@ -135,6 +136,13 @@ class Recorder:
         """Return whether the journal, which ends at a time, holds what comes after a restart."""
         return self._resumed_s is not None and end_s - _REPEATED_S <= time_s <= end_s
 
+    def _end_s(self, time_s: float, end_s: float) -> float:
+        """Return where a sensor's record ends now: a stamp that is wrong leaves its end."""
+        if end_s == _NEVER_S:
+            return time_s if math.isfinite(time_s) else end_s
+        is_near = abs(time_s - end_s) <= _STRAY_S or abs(time_s - self.last_tick_s) <= _STRAY_S
+        return time_s if is_near else end_s
+
     # checkpoints
 
     def marks(self) -> tuple[object, ...]:
@@ -174,11 +182,11 @@ class Recorder:
         match kind:
             case Kind.ODOMETRY:
                 odometry = to_odometry(body)
-                self.last_odometry_s = _end_s(odometry.time_s, self.last_odometry_s)
+                self.last_odometry_s = self._end_s(odometry.time_s, self.last_odometry_s)
                 core.receive_odometry(odometry)
             case Kind.PING:
                 ping = to_ping(body, self._fan or b"")
-                self._last_ping_s = _end_s(ping.time_s, self._last_ping_s)
+                self._last_ping_s = self._end_s(ping.time_s, self._last_ping_s)
                 core.receive_ping(ping)
             case Kind.FAN:
                 self._fan = body
@@ -195,8 +203,3 @@ class Recorder:
                 self._polled[1].append(core.poll(now_s))
             case _:
                 other(kind, body)
-
-
-def _end_s(time_s: float, end_s: float) -> float:
-    """Return where a sensor's record ends now: a stamp that is no time leaves its end."""
-    return time_s if math.isfinite(time_s) else end_s

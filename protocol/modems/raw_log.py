@@ -28,7 +28,8 @@ class LogLine:
 class RawLog:
     """A tap that writes to an open text file; hand it to `ModemContext(tap=...)`.
 
-    Lines that the disk did not take at once are counted in `unwritten`; the modem goes on.
+    It ends with the first line that the disk does not take, so that what there is replays as it
+    was; the lines from there on are counted in `unwritten`, and the modem goes on.
     """
 
     def __init__(self, file: TextIO) -> None:
@@ -36,6 +37,9 @@ class RawLog:
 
     def __call__(self, direction: str, data: bytes, now_s: float) -> None:
         """Write one line, and have it on disk before the modem's next word."""
+        if self.unwritten:
+            self.unwritten += 1
+            return
         line = {"t": now_s, "way": direction, "hex": data.hex()}
         try:
             self._file.write(json.dumps(line) + "\n")

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import time
 from pathlib import Path
+from typing import Any
 from unittest.mock import MagicMock
 
 import pytest
@@ -237,6 +238,36 @@ def test_a_raw_log_on_a_full_disk_costs_no_frame(tmp_path: Path) -> None:
         assert (both.frames(0), both.frames(1)) == ([b"in"], [b"out"])
         assert both.drivers[0].status().queued == 0
     assert log.unwritten > 0
+
+
+class SmallDisk(io.RawIOBase):
+    """A file that takes nothing while it is full."""
+
+    def __init__(self) -> None:
+        self.is_full, self.data = False, b""
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: Any) -> int:
+        if self.is_full:
+            raise OSError("No space left on device")
+        self.data += bytes(data)
+        return len(data)
+
+
+def test_a_raw_log_ends_where_a_disk_was_full_and_so_replays_as_it_was() -> None:
+    disk = SmallDisk()
+    file = io.TextIOWrapper(io.BufferedWriter(disk))
+    log = RawLog(file)
+    for n in range(300):
+        disk.is_full = 100 <= n < 250
+        log("in", bytes([n % 256]) * 40, float(n))
+    file.close()
+    times_s = [line.t_s for line in read_log(io.StringIO(disk.data.decode()))]
+    assert times_s == [float(n) for n in range(len(times_s))]
+    assert len(times_s) >= 100
+    assert log.unwritten == 200
 
 
 def test_a_raw_log_cut_by_a_crash_or_damaged_is_read_or_named() -> None:

@@ -97,7 +97,10 @@ def run(
     record: Callable[[Delivery], None],
     progress: Progress | None = None,
 ) -> None:
-    """Drive all nodes to the end: deliveries in the order of time, then each tick in turn."""
+    """Drive all nodes to the end: deliveries in the order of time, then each tick in turn.
+
+    What is under way at the end is recorded, too, though nobody hears it any more.
+    """
     for step in itertools.count():
         now_s = step * tick_s
         if now_s > duration_s + 1e-9:
@@ -113,3 +116,5 @@ def run(
                 water.transmit(number, now_s, frame)
         if progress is not None:
             progress(now_s)
+    for delivery in water.deliveries_until(np.inf):
+        record(delivery)

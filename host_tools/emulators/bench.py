@@ -103,6 +103,11 @@ class Bench:
         self.now_s = max(self.now_s, now_s)
         self._do_due()
 
+    def end(self) -> None:
+        """Record what is still under way; nobody hears it any more."""
+        for delivery in self.water.deliveries_until(math.inf):
+            self._note(delivery)
+
     def next_event_s(self) -> float:
         """Return when something will happen by itself, inf when nothing will."""
         times = [unit.next_wakeup_s(self.now_s) for unit in self.units.values()]
@@ -139,10 +144,13 @@ class Bench:
                     self._detections.append((self.now_s + travel_s, other, node, self.now_s))
         self._detections.sort()
 
-    def _deliver(self, delivery: Delivery) -> None:
+    def _note(self, delivery: Delivery) -> None:
         self.fates[delivery.fate] = self.fates.get(delivery.fate, 0) + 1
         if self._record is not None:
             self._record(delivery)
+
+    def _deliver(self, delivery: Delivery) -> None:
+        self._note(delivery)
         packet = self._airborne.get((delivery.source, delivery.t_tx_s))
         unit = self.units.get(delivery.destination)
         if packet is None or unit is None or delivery.fate in {"out-of-reach", "half-duplex"}:

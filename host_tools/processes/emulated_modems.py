@@ -77,11 +77,12 @@ class EmulatedModems:
         for step in itertools.count():
             now_s = step * tick_s
             if now_s > duration_s + 1e-9:
-                return
+                break
             self.bench.advance(now_s)
             for node in nodes.values():
                 node.tick(now_s)
             progress(now_s)
+        self.bench.end()
 
 
 class ModemNode(RemoteNode):

@@ -5,6 +5,9 @@ import numpy as np
 import pytest
 
 from host_tools.cli import main
+from host_tools.mission import run
+from host_tools.nodes import BeliefLog
+from protocol.acoustics import Delivery, Water, WaterSettings
 
 SHORT = ["--set", "duration_min=2.5", "--set", "follower_duration_min=2", "--set", "beams=48"]
 
@@ -31,6 +34,28 @@ def test_same_seed_writes_the_same_air_byte_for_byte(
         rows = np.loadtxt(tmp_path / "a" / f"{name}.tum")
         np.testing.assert_array_equal(rows[:, 0], np.arange(151.0))
         assert np.isfinite(rows).all()
+
+
+class Talker:
+    """A node that transmits the same frame every four seconds."""
+
+    def __init__(self, frame: bytes | None) -> None:
+        self.frame, self.log, self.heard = frame, BeliefLog(), 0
+
+    def hear(self, frame: bytes, toa_s: float | None, now_s: float) -> None:  # noqa: ARG002
+        self.heard += 1
+
+    def tick(self, now_s: float) -> bytes | None:
+        return self.frame if now_s % 4.0 == 0.0 else None
+
+
+def test_a_frame_under_way_at_the_end_is_recorded_and_heard_by_nobody() -> None:
+    water = Water(WaterSettings(loss=0.0), np.random.default_rng(1), lambda *_: (0.0, 0.0, 9.0))
+    nodes: dict[int, Talker] = {0: Talker(None), 1: Talker(bytes(256))}
+    recorded: list[Delivery] = []
+    run(nodes, water, duration_s=9.0, tick_s=0.25, record=recorded.append)
+    assert [delivery.t_tx_s for delivery in recorded] == [0.0, 4.0, 8.0]
+    assert nodes[0].heard == 2
 
 
 def test_a_folder_that_is_used_again_tells_of_the_new_mission_only(

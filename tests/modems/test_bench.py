@@ -48,6 +48,16 @@ def test_packets_that_meet_at_a_receiver_are_both_lost_there() -> None:
     assert bench.fates["collision"] == 2
 
 
+def test_a_packet_under_way_at_the_end_is_counted_and_heard_by_nobody() -> None:
+    bench = bench_of(NanomodemUnit, 2)
+    bench.units[1].receive_data(b"$B05hello", 0.0)
+    bench.advance(0.3)
+    assert not bench.fates
+    bench.end()
+    assert bench.fates == {"delivered": 1}
+    assert bench.units[2].poll(10.0) == b""
+
+
 def test_modems_of_two_dialects_in_one_water_do_not_understand_each_other() -> None:
     def make(node: int) -> Unit:
         return NanomodemUnit(node) if node == 1 else MicroModemUnit(node)

@@ -100,7 +100,7 @@ def sail(
         progress=at,
     )
     group.end()
-    return deliveries
+    return [delivery for delivery in deliveries if delivery.t_delivered_s <= duration_s]
 
 
 def heard_frames(talker: Talker) -> list[bytes]:

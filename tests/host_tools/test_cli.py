@@ -1,4 +1,6 @@
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +46,26 @@ def frames() -> list[bytes]:
         hyperparameters=np.array([0.1, 1.0, 0.02, 40.0], dtype=np.float32),
     )
     return [encode(answer), encode(fragment)]
+
+
+INTERRUPTED = """
+import os, signal, sys
+from host_tools.cli import main
+
+class Interrupts:
+    def find_spec(self, name, *_):
+        if name == "host_tools.simulate":
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupts())
+sys.exit(main(["config", "show"]))
+"""
+
+
+def test_a_command_interrupted_while_it_is_imported_says_so_in_one_line() -> None:
+    done = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, check=False)
+    assert (done.returncode, done.stdout) == (2, b"")
+    assert done.stderr == b"fathomlink: interrupted\n"
 
 
 def test_config_show_lists_settings_with_units_and_reasons(

@@ -80,9 +80,14 @@ class RemoteNode:
         return None
 
     def begin(self, now_s: float) -> None:
-        """Serve the time to the process, if it is there and has answered the last one."""
+        """Serve the time to the process, if it is there and has answered the last one.
+
+        One that comes back is served the time that it is then.
+        """
         if not self.is_answered:
             self.counters["periods_missed"] += 1
+            if self.line is None:
+                self.now_s = now_s
             return
         self.now_s, self.is_answered = now_s, False
         if self.line is not None:

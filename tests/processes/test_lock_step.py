@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 from firmware.ports import ModemPort
+from host_tools.emulators.ptys import PseudoPort
 from host_tools.mission import run
+from host_tools.processes.control import Advance, ControlLine, Done
 from host_tools.processes.pace import Pace
 from host_tools.processes.process_group import ProcessGroup
 from host_tools.processes.remote_node import MOST_TRIES, RemoteNode
@@ -24,6 +26,7 @@ from protocol.framing import wrap
 from protocol.modems.base import Reception
 from protocol.modems.loopback import LoopbackMedium
 from protocol.modems.registry import open_modem
+from protocol.modems.serial_line import DEFAULT_BAUD
 
 TICK_S = 0.25
 QUIET = WaterSettings(loss=0.0, outlier_share=0.0)
@@ -276,6 +279,25 @@ def test_in_real_time_a_process_that_is_down_is_not_waited_for(tmp_path: Path) -
             thread.join()
     assert missed >= 55
     assert leader.error is None
+
+
+def test_in_real_time_a_process_that_comes_back_is_told_the_time_that_it_is() -> None:
+    port = PseudoPort(DEFAULT_BAUD)
+    node = RemoteNode(1, port, lambda _: None, lambda _: None, lambda: True)
+    (first, dead), (again, theirs) = (map(ControlLine, socket.socketpair()) for _ in range(2))
+    node.join(first)
+    node.begin(1.0)
+    node.leave()
+    dead.close()
+    for now_s in (1.25, 61.25):
+        node.begin(now_s)
+    node.join(again)
+    assert theirs.receive() == [Advance(now_s=61.25)]
+    node.answer(Done(now_s=61.25))
+    assert node.is_answered
+    node.leave()
+    theirs.close()
+    port.close()
 
 
 @pytest.mark.skipif(shutil.which("socat") is None, reason="apt-get install socat")

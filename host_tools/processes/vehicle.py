@@ -35,6 +35,7 @@ from host_tools.mission import deployed
 from host_tools.processes.records import VehicleFiles
 from host_tools.processes.resume import (
     SilentModem,
+    lasting_start_s,
     missed_instants,
     navigated,
     open_core,
@@ -55,7 +56,7 @@ from protocol.vehicles import BOOT_EPOCHS, LEADER
 
 LOG = logging.getLogger(__name__)
 STATUS_S = 60.0
-WALL = "wall"
+WALL, NEXT = "wall", "next"
 
 
 @dataclass(slots=True)
@@ -94,7 +95,7 @@ def run_vehicle(
     sealed = voyage if seal is None else sealed_voyage(voyage)
     is_at_sea = store is not None and any(store.glob("*.sqlite"))
     modem, clock = _modem_and_clock(
-        vehicle, modem_url, clock_url, voyage, start, seal, must_answer=not is_at_sea
+        vehicle, modem_url, clock_url, voyage, start, store, seal, must_answer=not is_at_sea
     )
     files = None if out is None else VehicleFiles(out, vehicle)
     try:
@@ -239,6 +240,7 @@ def _modem_and_clock(
     clock_url: str,
     voyage: Voyage,
     start: str,
+    store: Path | None,
     seal: SealedLink | None,
     *,
     must_answer: bool,
@@ -247,8 +249,10 @@ def _modem_and_clock(
     context = ModemContext() if seal is None else ModemContext(stamp=seal.stamp)
     if clock_url == WALL:
         modem = open_modem(modem_url, context)
-        start_utc_s = start_time_s(start)
-        wall = WallClock(start_utc_s, voyage.settings.scenario.duration_s)
+        start_utc_s, duration_s = start_time_s(start), voyage.settings.scenario.duration_s
+        if start == NEXT and store is not None:
+            start_utc_s = lasting_start_s(store, vehicle, start_utc_s, duration_s)
+        wall = WallClock(start_utc_s, duration_s)
         if must_answer and isinstance(modem, DialectDriver):
             await_identified(modem, wall.now_s, time.sleep)
         began = datetime.datetime.fromtimestamp(start_utc_s, datetime.UTC)
@@ -275,7 +279,7 @@ def start_time_s(text: str) -> float:
     ConfigError
         For a text that is no time, or one that is no whole second.
     """
-    if text == "next":
+    if text == NEXT:
         return 60.0 * math.ceil(time.clock_gettime(time.CLOCK_REALTIME) / 60.0)
     try:
         moment = datetime.datetime.fromisoformat(text)
@@ -328,7 +332,10 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         help="wall: this computer's UTC (default); or the name that `fathomlink channel` prints",
     )
     parser.add_argument(
-        "--start", default="next", metavar="UTC", help="with the wall clock; default: next minute"
+        "--start",
+        default=NEXT,
+        metavar="UTC",
+        help="with the wall clock; default: next minute, or that of the --store",
     )
     parser.add_argument("--out", type=folder_of, metavar="DIR", help="where the vehicle's files go")
     parser.add_argument(

@@ -15,7 +15,9 @@ import pytest
 from firmware.clock import WallClock
 from host_tools.cli import main
 from host_tools.emulators.ptys import PseudoPort
+from host_tools.processes import vehicle as vehicle_process
 from host_tools.processes.demo import Crew
+from host_tools.processes.resume import lasting_start_s
 from host_tools.processes.sealing import seal_of
 from host_tools.processes.vehicle import start_time_s
 from protocol.codec import decode, encode
@@ -183,6 +185,35 @@ def test_a_start_is_a_whole_second_of_utc() -> None:
     assert start_time_s("next") % 60.0 == 0.0
     with pytest.raises(ConfigError, match="whole second"):
         start_time_s("1970-01-01T00:00:00.5Z")
+
+
+def test_the_next_start_stays_that_of_a_stores_first_life_while_its_mission_lasts(
+    tmp_path: Path,
+) -> None:
+    starts_s = [lasting_start_s(tmp_path, 1, now_s, 600.0) for now_s in (60.0, 120.0, 660.0, 720.0)]
+    assert starts_s == [60.0, 60.0, 60.0, 720.0]
+    assert lasting_start_s(tmp_path, 0, 180.0, 600.0) == 180.0
+    (tmp_path / "follower_1.start").write_text("damaged")
+    assert lasting_start_s(tmp_path, 1, 780.0, 600.0) == 780.0
+    assert lasting_start_s(tmp_path, 1, 840.0, 600.0) == 780.0
+    assert lasting_start_s(tmp_path / "nowhere", 1, 60.0, 600.0) == 60.0
+
+
+def test_a_vehicle_started_again_with_its_store_sails_the_same_mission(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    starts_s: list[float] = []
+
+    def told(start_utc_s: float, _: float) -> None:
+        starts_s.append(start_utc_s)
+        raise ConfigError("enough")
+
+    monkeypatch.setattr(vehicle_process, "open_modem", lambda *_: None)
+    monkeypatch.setattr(vehicle_process, "WallClock", told)
+    for minute_s in (60.0, 120.0):
+        monkeypatch.setattr(vehicle_process, "start_time_s", lambda _, at_s=minute_s: at_s)
+        assert main(["follower", "--modem", "serial:///x", "--store", str(tmp_path / "s")]) == 2
+    assert starts_s == [60.0, 60.0]
 
 
 @pytest.mark.slow

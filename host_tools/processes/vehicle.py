@@ -52,7 +52,7 @@ from protocol.modems.base import Modem, ModemContext
 from protocol.modems.dialect_driver import DialectDriver, await_identified, check_frame_size
 from protocol.modems.registry import open_modem
 from protocol.modems.sealed import SealedLink, SealedModem
-from protocol.vehicles import BOOT_EPOCHS, LEADER
+from protocol.vehicles import BOOT_EPOCHS, LEADER, name_of
 
 LOG = logging.getLogger(__name__)
 STATUS_S = 60.0
@@ -93,7 +93,7 @@ def run_vehicle(
         prepare_store(store)
     seal = None if key is None else seal_of(vehicle, key, store, encrypts=encrypts)
     sealed = voyage if seal is None else sealed_voyage(voyage)
-    is_at_sea = store is not None and any(store.glob("*.sqlite"))
+    is_at_sea = store is not None and (store / f"{name_of(vehicle)}.sqlite").exists()
     modem, clock = _modem_and_clock(
         vehicle, modem_url, clock_url, voyage, start, store, seal, must_answer=not is_at_sea
     )

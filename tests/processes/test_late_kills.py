@@ -13,6 +13,7 @@ from firmware.dead_reckoning import ReckonedState
 from firmware.leader.atlas import SheetId, sheet_of
 from firmware.leader.journaled import JournaledLeader
 from firmware.submaps import GriddedSubmap, Track
+from host_tools.emulators.ptys import PseudoPort
 from host_tools.processes import vehicle
 from host_tools.processes.process_group import ProcessGroup
 from host_tools.processes.records import VehicleFiles
@@ -20,6 +21,7 @@ from host_tools.processes.vehicle import Aboard
 from host_tools.processes.voyage import Voyage, add_voyage_arguments, voyage_of
 from protocol.acoustics import Water, WaterSettings
 from protocol.errors import ConfigError
+from protocol.modems.serial_line import DEFAULT_BAUD
 
 SHORT = ["--set", "duration_min=0.5", "--set", "follower_duration_min=0.5", "--set", "beams=32"]
 
@@ -105,6 +107,19 @@ def test_process_killed_after_its_last_instant_ends_the_mission_when_it_starts_a
         assert isinstance(again, ConfigError)
         assert "no store holds it" in str(again)
         assert "leader.npz" not in files
+
+
+@pytest.mark.parametrize("other", ["follower_1.sqlite", "leader.aside-1.sqlite"])
+def test_the_store_of_another_vehicle_or_life_holds_no_mission_that_is_over(
+    voyage: Voyage, tmp_path: Path, other: str
+) -> None:
+    (tmp_path / other).touch()
+    port = PseudoPort(DEFAULT_BAUD)
+    with pytest.raises(ConfigError, match="no store holds it"):
+        vehicle.run_vehicle(
+            0, f"serial://{port.name}", "wall", voyage, None, "2020-01-01T00:00:00Z", tmp_path
+        )
+    port.close()
 
 
 def test_half_a_row_that_a_full_disk_left_spoils_no_later_one(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 LOG = logging.getLogger(__name__)
 _EARLY_S = 1e-6
+_TOLD_EVERY_S = 60.0  # of a task that fails again and again: its traceback must not fill a disk
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,6 +26,7 @@ class Executive:
     def __init__(self, tasks: Sequence[Task], stopwatch: Callable[[], float]) -> None:
         self._tasks, self._stopwatch = tuple(tasks), stopwatch
         self._due_s = {task.name: -float("inf") for task in self._tasks}
+        self._told_s = dict(self._due_s)
         self.counters: Counter[str] = Counter()
 
     def step(self, now_s: float) -> None:
@@ -39,6 +41,8 @@ class Executive:
                 task.work(now_s)
             except Exception:
                 self.counters[f"{task.name}_failed"] += 1
-                LOG.exception("%s failed at %.3f s", task.name, now_s)
+                if abs(now_s - self._told_s[task.name]) >= _TOLD_EVERY_S:
+                    self._told_s[task.name] = now_s
+                    LOG.exception("%s failed at %.3f s", task.name, now_s)
             if self._stopwatch() - began_s > task.deadline_s:
                 self.counters[f"{task.name}_overran"] += 1

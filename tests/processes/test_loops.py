@@ -128,6 +128,21 @@ def test_what_goes_wrong_in_one_task_does_not_stop_the_others(
     assert "bad failed at 0.000 s" in caplog.text
 
 
+def test_a_task_that_fails_all_day_is_counted_and_told_once_a_minute(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def fail(now_s: float) -> None:
+        raise ValueError(f"at {now_s}")
+
+    executive = Executive(
+        (Task(name="bad", period_s=0.25, deadline_s=1.0, work=fail),), lambda: 0.0
+    )
+    for quarter in range(4 * 600):
+        executive.step(quarter / 4)
+    assert executive.counters == {"bad_failed": 2400}
+    assert len(caplog.records) == 10
+
+
 def test_tasks_keep_their_periods_and_late_ones_are_counted() -> None:
     ran: list[float] = []
     clock = iter([0.0, 0.1, 10.0, 10.5, 20.0, 20.1])

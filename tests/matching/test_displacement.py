@@ -1,5 +1,6 @@
 """Roll and refraction move what a sonar sees aside; closures are told where it really lay."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -56,3 +57,32 @@ def test_what_is_not_known_of_two_sonars_adds_up() -> None:
     alone_m2 = (1e-4 * ALTITUDE_M) ** 2 * (1.0 + 4.0 * across**2)
     assert left_m2[1, 1] == pytest.approx(2.0 * alone_m2)
     assert left_m2[0, 0] == pytest.approx(0.0)
+
+
+def test_each_sonar_errs_by_itself() -> None:
+    """One that errs sees a place to port of another one that does not."""
+    erring = _look(STARBOARD)
+    right = dataclasses.replace(
+        _look(STARBOARD, vehicle=2), errors=np.zeros(2), covariance=np.zeros((2, 2))
+    )
+    seen_m, true_m = _seen_across_m(30.0) * STARBOARD, -20.0 * STARBOARD
+    alone_m2 = (1e-4 * ALTITUDE_M) ** 2 * (1.0 + 4.0 * (30.0 / HALF_WIDTH_M) ** 2)
+    for looks, levers in (((erring, right), (seen_m, true_m)), ((right, erring), (true_m, seen_m))):
+        added_m, left_m2 = displaced(looks, levers)
+        apart_m = (levers[0] - levers[1] + added_m)[1]
+        assert abs(apart_m) == pytest.approx(50.0, abs=0.03)
+        assert left_m2[1, 1] == pytest.approx(alone_m2, rel=0.05)
+
+
+def test_what_is_not_known_of_one_sonar_counts_twice_between_opposite_headings() -> None:
+    lever_m = 30.0 * STARBOARD
+    _, left_m2 = displaced((_look(STARBOARD), _look(-STARBOARD)), (lever_m, -lever_m))
+    alone_m2 = (1e-4 * ALTITUDE_M) ** 2 * (1.0 + 4.0 * (30.0 / HALF_WIDTH_M) ** 2)
+    assert left_m2 == pytest.approx(np.diag([0.0, 4.0 * alone_m2]))
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_nothing_is_moved_farther_than_at_the_edge_of_the_swath(side: float) -> None:
+    edge_m, look = side * HALF_WIDTH_M * STARBOARD, _look(STARBOARD)
+    assert look.displacement(3.0 * edge_m) == pytest.approx(look.displacement(edge_m))
+    assert look.displacement(0.9 * edge_m) != pytest.approx(look.displacement(edge_m))

@@ -159,6 +159,16 @@ def test_corrections_decide_which_place_is_covered() -> None:
     sheets = [sheet_at(0.0, k) for k in range(3)]
     moves_m = np.array([[0.0, 0.0], [300.0, 0.0], [600.0, 0.0]])
     assert redundant(sheets, moves_m, CoverageSettings(layers=1)) == []
+    apart = [sheet_at(300.0 * k, k) for k in range(3)]
+    moves_m = np.array([[0.0, 0.0], [-300.0, 0.0], [600.0, 0.0]])
+    assert redundant(apart, moves_m, CoverageSettings(layers=1)) == [apart[1].id]
+
+
+@pytest.mark.parametrize(("new_m", "needed"), [(10.0, False), (40.0, True)])
+def test_a_sub_map_is_needed_where_a_good_part_of_it_is_new(new_m: float, *, needed: bool) -> None:
+    sheets = [sheet_at(0.0, 0), sheet_at(new_m, 1)]
+    found = redundant(sheets, np.zeros((2, 2)), CoverageSettings(layers=1))
+    assert found == ([] if needed else [sheets[1].id])
 
 
 def test_a_closure_whose_sub_map_was_dropped_meanwhile_is_asked_no_map() -> None:

@@ -63,6 +63,22 @@ def test_window_with_two_equal_explanations_is_left_undecided() -> None:
     assert judge.judge(measured_m, true_m, TIMES_S[:6], 2.0).certain
 
 
+@pytest.mark.parametrize(
+    ("seconds", "off_m", "believed"), [(18.0, 7.0, False), (60.0, 7.0, True), (60.0, 16.0, False)]
+)
+def test_ranges_scatter_as_far_as_dead_reckoning_errs_meanwhile(
+    seconds: float, off_m: float, *, believed: bool
+) -> None:
+    """The root of a metre's noise and 1.3 m in 20 s, or 2.3 m in a minute; beyond it is wild."""
+    true_m = np.full(10, 300.0)
+    measured_m = true_m + off_m * (np.arange(10) == 5)
+    judge = RangeJudge(RangeSettings())
+    verdict = judge.judge(measured_m, true_m, np.linspace(0.0, seconds, 10), 3.0)
+    assert verdict.certain
+    assert np.delete(verdict.true, 5).all()
+    assert (verdict.true[5], verdict.stretched[5]) == (believed, False)
+
+
 @pytest.mark.parametrize("bad_m", [0.0, -3.0, 100_000.0, np.nan, np.inf])
 def test_impossible_range_is_neither_true_nor_stretched(bad_m: float) -> None:
     measured_m = np.array([300.0, bad_m, 301.0, 299.5])

@@ -136,8 +136,6 @@ def largest_clique(agree: NDArray[np.bool_], seeds: int) -> NDArray[np.intp]:
     Each step takes the candidate that leaves most candidates; the largest of the cliques so grown
     is returned, the first of equals.
     """
-    if not len(agree):
-        return np.zeros(0, dtype=np.intp)
     order = np.argsort(-agree.sum(axis=1), kind="stable")
     best: list[int] = []
     for seed in order[:seeds]:

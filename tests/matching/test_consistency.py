@@ -98,6 +98,28 @@ def test_pairs_without_odometry_between_them_do_not_contradict() -> None:
     assert not result.partners.any()
 
 
+@pytest.mark.parametrize("ends", [(10, 1010), (1010, 10)])
+def test_of_two_loops_the_tighter_one_decides(ends: tuple[int, int]) -> None:
+    """The other way round dead reckoning is so unsure that everything agrees."""
+
+    def at_anchor(first: Keys, second: Keys) -> tuple[Array, Array]:
+        variance_m2 = 0.1 * np.abs(second - first)
+        return np.zeros((first.size, 2)), variance_m2[:, None, None] * np.eye(2)
+
+    def closure(origin: int, target: int, north_m: float) -> CandidateClosure:
+        return CandidateClosure(
+            origin=origin,
+            target=target,
+            offset_m=np.array([north_m, 0.0]),
+            covariance_m2=0.25 * np.eye(2),
+        )
+
+    for north_m, is_alike in ((2.0, True), (20.0, False)):
+        pair = [closure(0, 1000, north_m), closure(*ends, 0.0)]
+        agree, known = agreement(pair, at_anchor, SETTINGS)
+        assert (bool(agree[0, 1]), bool(known[0, 1])) == (is_alike, True)
+
+
 def test_none_and_one_closure_are_consistent() -> None:
     truth, odometry = survey(np.random.default_rng(6))
     assert judged([], odometry, SETTINGS).believed.size == 0

@@ -29,10 +29,9 @@ def conflict_free_reach_m(settings: SlotSettings, air: Air) -> float:
         for offset_s in settings.leader_offsets_s
         for turn in range(slot_s)  # after slot_s periods the two rasters repeat
     )
-    guards_s = [slot_s - air.frame_s]
-    for phase_s in {start_s % slot_s for start_s in starts_s}:
-        guards_s += [phase_s - air.frame_s, slot_s - phase_s - air.answer_s]
-    return max(0.0, min(guards_s)) * air.sound_speed_mps
+    phases_s = {start_s % slot_s for start_s in starts_s}
+    guard_s = min(min(phases_s) - air.frame_s, slot_s - max(phases_s) - air.answer_s)
+    return max(0.0, guard_s) * air.sound_speed_mps
 
 
 def test_one_follower_has_every_fourth_second_and_the_leader_two_in_twenty() -> None:
@@ -50,8 +49,9 @@ def test_a_slot_that_just_began_is_still_now() -> None:
 def test_followers_take_turns_and_never_share_a_slot() -> None:
     slots = Slots(SlotSettings(followers=4))
     starts = [slots.next_follower_slot_s(100.0, follower) for follower in (1, 2, 3, 4)]
-    assert sorted(starts) == [100.0, 104.0, 108.0, 112.0]
+    assert starts == [112.0, 100.0, 104.0, 108.0]  # the first one's begin every 16 s
     assert slots.frames_per_submap(40.0) == 2
+    assert Slots(SlotSettings(followers=4, frames_per_slot=2)).frames_per_submap(40.0) == 4
 
 
 @given(st.floats(0, 1e6), st.integers(0, 4))
@@ -84,17 +84,40 @@ def test_a_slot_is_missed_a_little_late_and_holds_as_many_frames_as_it_may() -> 
     assert turns.due_s(8.0) == 8.0
     turns.skip(8.0)
     assert turns.due_s(8.0) is None
+    assert [turns.due_s(12.0) for _ in range(3)] == [12.0, 12.0, None]
+    assert [turns.due_s(16.0) for _ in range(3)] == [16.0, 16.0, None]
+
+
+def test_the_leader_has_one_frame_a_slot_and_misses_none_between_them() -> None:
+    turns = Turns(Slots(SlotSettings(frames_per_slot=2)), 0, 0.0)
+    due_s = [turns.due_s(now_s) for now_s in (3.0, 3.0, 4.0, 11.0, 11.0, 12.0)]
+    assert due_s == [3.0, None, None, 11.0, None, None]
+    assert turns.missed == 0
+
+
+def test_a_clock_set_back_by_more_than_slots_lie_apart_costs_no_slot() -> None:
+    turns = Turns(Slots(SlotSettings()), 1, 1000.0)
+    assert [turns.due_s(now_s) for now_s in (1000.0, 988.0)] == [1000.0, 988.0]
 
 
 def test_slots_that_cannot_be_are_refused() -> None:
     with pytest.raises(ConfigError, match="from 0 to 19"):
         SlotSettings(leader_offsets_s=(3, 25))
-    with pytest.raises(ConfigError, match="follower 3 has no slot"):
-        Slots(SlotSettings(followers=2)).next_slot_s(3, 0.0)
+    with pytest.raises(ConfigError, match="from 0 to 19"):
+        SlotSettings(leader_offsets_s=(-1, 11))
+    for follower in (0, 3):
+        with pytest.raises(ConfigError, match=f"follower {follower} has no slot"):
+            Slots(SlotSettings(followers=2)).next_follower_slot_s(0.0, follower)
 
 
 def test_the_papers_slots_are_free_of_conflict_to_twelve_hundred_metres() -> None:
     assert conflict_free_reach_m(SlotSettings(), Air()) == pytest.approx(1236.0)
+    assert planned_slots(1, 1200.0, Air()) == SlotSettings()
+
+
+def test_where_slots_are_long_the_reach_ends_where_a_frame_meets_the_answer() -> None:
+    slots = SlotSettings(follower_slot_s=8, leader_period_s=24, leader_offsets_s=(3,))
+    assert conflict_free_reach_m(slots, Air()) == pytest.approx((3.0 - 2.048) * 1500.0)
 
 
 @given(st.integers(1, 8), st.floats(100.0, 10_000.0), st.sampled_from([22, 42, 54]))

@@ -196,6 +196,38 @@ def test_what_the_pair_itself_has_told_does_not_make_it_better_known(graph: Pose
     assert _looks(graph, before.prior_radius_m, hint) == []
 
 
+def test_what_is_taken_out_of_an_offset_leaves_the_composed_past_as_unsure_as_it_was(
+    graph: PoseGraph,
+) -> None:
+    (offset,) = offsets_of([_two_sheets()], graph)
+    apart_m2, told_m2 = np.diag([30.0, 50.0]), np.array([[20.0, 5.0], [5.0, 40.0]])
+    open_m2, told_m = offset.covariance_m2, np.array([7.0, -4.0])
+    both_m2 = np.linalg.inv(np.linalg.inv(open_m2) + np.linalg.inv(told_m2))
+    met_m = both_m2 @ (np.linalg.solve(open_m2, offset.shift_m) + np.linalg.solve(told_m2, told_m))
+    told = dataclasses.replace(
+        offset, shift_m=met_m, covariance_m2=both_m2 + apart_m2, apart_m2=apart_m2
+    )
+    left = told.without(told_m, told_m2)
+    assert left.shift_m == pytest.approx(offset.shift_m, abs=1e-6)
+    assert left.covariance_m2 == pytest.approx(open_m2 + apart_m2)
+    assert left.open_sigma_m == pytest.approx(offset.sigma_m)
+
+
+def test_pairs_with_a_sheet_on_no_node_are_left_out_and_ways_to_nodes_add_up(
+    graph: PoseGraph,
+) -> None:
+    first, second = _two_sheets()
+    lost = dataclasses.replace(first, id=dataclasses.replace(first.id, vehicle=1))
+    assert offsets_of([(lost, second)], graph) == []
+    graph.lose(0, 19.0, 23.0)
+    graph.lose(0, 101.0, 107.0)
+    (offset,) = offsets_of([(first, lost), (first, second)], graph)
+    assert (offset.origin, offset.target) == (first, second)
+    ways_m2 = [graph.anchor(0, sheet.time_s, sheet.track).apart_m2 for sheet in (first, second)]
+    assert ways_m2[0][0, 0] > ways_m2[1][0, 0] > 0.0
+    assert offset.apart_m2 == pytest.approx(ways_m2[0] + ways_m2[1])
+
+
 def test_offset_tells_drift_as_the_time_between_the_sheets_says(graph: PoseGraph) -> None:
     origin, target = _two_sheets()
     (offset,) = offsets_of([(origin, target)], graph)

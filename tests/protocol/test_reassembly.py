@@ -175,7 +175,32 @@ def test_reassembler_hands_on_the_oldest_when_slots_are_full() -> None:
         reassembler.receive(submap(0, vehicle=vehicle)[0], float(vehicle))
     (transfer,) = transfers(reassembler)
     assert (transfer.vehicle, transfer.reason) == (1, "evicted")
-    assert reassembler.counters.evicted == 1
+    counters = reassembler.counters
+    assert (counters.evicted, counters.partial, counters.open) == (1, 1, 2)
+    reassembler.flush()
+    assert (counters.partial, counters.open) == (3, 0)
+
+
+@pytest.mark.parametrize(("repeated", "waits_s"), [(9, SETTINGS.overtaken_s), (10, 60.0)])
+def test_an_overtaken_transfer_waits_for_repeats_where_there_are_any(
+    repeated: int, waits_s: float
+) -> None:
+    reassembler = Reassembler(ReassemblySettings(fragments_with_repeats=repeated))
+    reassembler.receive(submap(3)[0], 0.0)
+    reassembler.receive(submap(4)[0], 40.0)
+    reassembler.advance(40.0 + waits_s - 0.1)
+    assert transfers(reassembler) == []
+    reassembler.advance(40.0 + waits_s)
+    assert [(t.submap, t.reason) for t in transfers(reassembler)] == [(3, "overtaken")]
+
+
+def test_only_so_many_closed_transfers_are_remembered() -> None:
+    reassembler = Reassembler(ReassemblySettings(remembered=2))
+    for index in (1, 2, 3, 2, 1):
+        for packet in submap(index):
+            reassembler.receive(packet, 0.0)
+    assert [t.submap for t in transfers(reassembler)] == [1, 2, 3, 1]
+    assert reassembler.counters.spare == 10
 
 
 def test_a_restart_with_counter_zero_is_a_new_submap_of_a_new_epoch() -> None:

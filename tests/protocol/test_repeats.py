@@ -70,8 +70,18 @@ def test_what_the_leader_has_closed_is_repeated_no_more() -> None:
     assert queue.counters["overtaken"] == 3
     queue.request(0, 0b1_0001, asked_s=200.0)
     queue.request(0, 0b1_0000, asked_s=210.0)  # fragment 0 has come meanwhile
-    queue.request(0xFFFF, 0, asked_s=210.0)  # an answer that asks for nothing
+    queue.request(1, 0, asked_s=210.0)  # an answer that asks for nothing
     assert send_all(queue, 220.0) == [(0, 4)]
+    assert queue.counters["repeated"] == 3
+
+
+def test_what_is_wanted_of_a_newer_submap_stays_when_an_older_one_is_asked_for() -> None:
+    queue = queue_with(index=0xFFFF)
+    queue.add([paper_packet(submap=0, fragment=i, count=8) for i in range(8)])
+    send_all(queue)
+    queue.request(0, 0b1, asked_s=100.0)
+    queue.request(0xFFFF, 0b1, asked_s=110.0)
+    assert send_all(queue, 120.0) == [(0, 0), (0xFFFF, 0)]
 
 
 def test_a_request_made_before_the_last_copy_could_arrive_is_ignored() -> None:
@@ -125,12 +135,14 @@ def test_fresh_fragments_are_bounded_and_drops_counted() -> None:
 def test_a_forgotten_submap_takes_its_wishes_along() -> None:
     queue = queue_with(0)
     send_all(queue)
-    queue.request(0, 0b1, asked_s=100.0)
-    assert queue.wanted == 1
-    for index in range(1, SETTINGS.submaps_kept + 1):
+    queue.add([paper_packet(submap=1, fragment=0, count=1)])
+    send_all(queue, 40.0)
+    for index in (1, 0):
+        queue.request(index, 0b1, asked_s=100.0)
+    assert queue.wanted == 2
+    for index in range(2, SETTINGS.submaps_kept + 1):
         queue.add([paper_packet(submap=index, fragment=0, count=1)])
-    assert queue.wanted == 0
-    assert {index for index, _ in send_all(queue, 200.0)} == set(range(1, 7))
+    assert send_all(queue, 200.0) == [(1, 0), *((index, 0) for index in range(2, 7))]
 
 
 def test_at_14_percent_loss_repeats_complete_99_of_100_submaps_with_a_fifth_more_air() -> None:

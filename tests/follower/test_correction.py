@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from firmware.follower.correction import CorrectionSettings, DriftCorrection
-from firmware.follower.drift_filter import AnswerSeen, DriftFilter, DriftSettings
+from firmware.follower.drift_filter import (
+    AnswerSeen,
+    DriftFilter,
+    DriftSettings,
+    DriftState,
+    RangeSeen,
+)
 
 BIAS_MPS = np.array([0.1, -0.07])
 
@@ -87,6 +93,53 @@ def test_what_was_learned_of_a_walk_fades() -> None:
     assert np.ptp(learned) > 10.0
     later = drift.predicted(state, 9000.0 + 5.0 * 3600.0).log_weights - first.log_weights
     assert np.ptp(later) < 0.01 * np.ptp(learned)
+
+
+def test_drift_is_predicted_alike_in_one_step_and_in_many() -> None:
+    drift = DriftFilter(DriftSettings())
+    seen = AnswerSeen(time_s=300.0, ran_away_m=np.array([20.0, -9.0]), sigma_m=2.0)
+    once = steps = drift.updated(drift.deployed(100.0), seen)
+    for time_s in np.arange(310.0, 901.0, 10.0):
+        steps = drift.predicted(steps, float(time_s))
+    once = drift.predicted(once, 900.0)
+    np.testing.assert_allclose(steps.means, once.means)
+    np.testing.assert_allclose(steps.covariances, once.covariances, atol=1e-9)
+    np.testing.assert_allclose(steps.log_weights, once.log_weights)
+
+
+def test_a_range_teaches_what_draws_of_all_that_is_unsure_say() -> None:
+    rng, s = np.random.default_rng(5), DriftSettings()
+    root = np.diag([4.0, 3.0, 0.1, 0.1, 1.0, 1.0]) @ rng.standard_normal((6, 6)) / 2.0
+    mean, covariance = np.array([20.0, -10.0, 0.1, 0.0, 0.4, -0.6]), root @ root.T
+    seen = RangeSeen(
+        time_s=0.0,
+        reckoned_m=np.array([50.0, 60.0]),
+        leader_m=np.array([330.0, 460.0]),
+        leader_sigma_m=4.0,
+        range_m=470.0,
+        depth_difference_m=400.0,
+    )
+    draws = rng.multivariate_normal(mean, covariance, 400_000)
+    fresh = s.fresh_share * rng.standard_normal((400_000, 2))
+    leader_errors_m = seen.leader_sigma_m * (np.sqrt(1.0 - s.fresh_share**2) * draws[:, 4:] + fresh)
+    between_m = seen.reckoned_m - draws[:, :2] - (seen.leader_m - leader_errors_m)
+    slants_m = np.hypot(np.hypot(*between_m.T), seen.depth_difference_m)
+    slants_m += s.range_sigma_m * rng.standard_normal(400_000)
+    ranges_m = np.sqrt(slants_m**2 - seen.depth_difference_m**2)
+    joint = np.cov(draws.T, ranges_m)
+    gain = joint[:6, 6] / joint[6, 6]
+    state = DriftState(
+        time_s=0.0,
+        means=np.tile(mean, (9, 1)),
+        covariances=np.tile(covariance, (9, 1, 1)),
+        log_weights=np.zeros(9),
+    )
+    learned, known = DriftFilter(s).updated(state, seen), np.sqrt(np.diag(covariance))
+    expected = mean + gain * (seen.range_m - ranges_m.mean())
+    assert (learned.means[0] - expected) / known == pytest.approx(np.zeros(6), abs=0.03)
+    left = covariance - joint[6, 6] * np.outer(gain, gain)
+    away = (learned.covariances[0] - left) / np.outer(known, known)
+    assert away == pytest.approx(np.zeros((6, 6)), abs=0.03)
 
 
 def test_a_checkpoint_holds_what_was_seen_and_gives_the_same_belief() -> None:

@@ -12,7 +12,7 @@ from host_tools.simulator.seabed import Seabed
 
 SOUND_SPEED_MPS = 1500.0
 NEAR_M = 0.05  # where sphere tracing hands over to the secant
-MOST_STEPS = 60
+MOST_STEPS = 300  # grazing beams over steep ground; 20 do elsewhere
 SECANT_STEPS = 2
 STEEPEST = 5.0
 
@@ -95,9 +95,10 @@ def cast_rays(seabed: Seabed, poses: Poses, directions: Array) -> Array:
     """Return the distance (P, B) along each ray to the seabed's first surface, NaN for no-data.
 
     Sphere tracing: with the steepest slope L under the swath, a ray at a height g above the seabed
-    can go on by g / (down + L across) without passing through it. The last metres are left to the
-    secant. Rays pass over no-data as if it were filled from the nearest cell; one that ends there
-    is lost.
+    can go on by g / (down + L across) without passing through it. Where a wall is steeper than
+    `STEEPEST`, a ray that came into it goes back by half its step, and steps no farther from then
+    on. The last metres are left to the secant. Rays pass over no-data as if it were filled from the
+    nearest cell; one that ends there is lost.
     """
     shape = directions.shape[1:]
     d_north, d_east, d_down = (np.ascontiguousarray(d).ravel() for d in directions)
@@ -115,10 +116,16 @@ def cast_rays(seabed: Seabed, poses: Poses, directions: Array) -> Array:
     ranges_m = np.maximum(shallowest_m - origin[2], 0.0) * pace
     ranges_m[~going_down] = np.nan
     active = np.flatnonzero(going_down)
+    step_m, longest_m = np.zeros(ranges_m.size), np.full(ranges_m.size, np.inf)
     for _ in range(MOST_STEPS):
         gap_m = _gap(seabed, origin, (d_north, d_east, d_down), ranges_m, active)
-        ranges_m[active] += gap_m * pace[active]
-        active = active[gap_m > NEAR_M]
+        inside = gap_m < -NEAR_M
+        into = active[inside]
+        longest_m[into] = 0.5 * np.abs(step_m[into])
+        step_m[active] = np.minimum(gap_m * pace[active], longest_m[active])
+        step_m[into] = -longest_m[into]
+        ranges_m[active] += step_m[active]
+        active = active[np.abs(gap_m) > NEAR_M]
         if active.size == 0:
             break
     rays = np.flatnonzero(going_down)

@@ -1,3 +1,5 @@
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -36,8 +38,15 @@ def first_crossing(seabed: Seabed, origin: np.ndarray, direction: np.ndarray) ->
     return float(along_m[np.argmax(below)])
 
 
-def test_ray_stops_at_the_first_surface_even_behind_steep_hills() -> None:
-    seabed = hilly_seabed()
+def walled_seabed() -> Seabed:
+    depth_m = np.full((601, 601), 50.0)
+    depth_m[320:] = 20.0
+    return Seabed(depth_m, -300.0, -300.0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize("made", [hilly_seabed, walled_seabed])
+def test_ray_stops_at_the_first_surface_even_behind_steep_hills(made: Callable[[], Seabed]) -> None:
+    seabed = made()
     rng = np.random.default_rng(1)
     angles = rng.uniform(0.8, 1.25, 60)
     bearing = rng.uniform(0, 2 * np.pi, 60)

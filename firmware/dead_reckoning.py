@@ -22,6 +22,12 @@ class ReckonedState:
     east_m: float
     yaw_rad: float
     depth_m: float
+    velocity_mps: tuple[float, float] = (0.0, 0.0)  # north, east
+
+    def position_at(self, time_s: float) -> tuple[float, float]:
+        """Return north and east in m at a time near the state's, by its velocity."""
+        (north_mps, east_mps), ahead_s = self.velocity_mps, time_s - self.time_s
+        return self.north_m + north_mps * ahead_s, self.east_m + east_mps * ahead_s
 
 
 class DeadReckoning:
@@ -82,6 +88,7 @@ class DeadReckoning:
             east_m=self.state.east_m + self._velocity_mps[1] * moved_s,
             yaw_rad=yaw_rad,
             depth_m=_finite(odometry.depth_m, self.state.depth_m),
+            velocity_mps=self._velocity_mps,
         )
         return self.state
 

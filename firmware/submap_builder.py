@@ -13,7 +13,7 @@ from firmware.submaps import Submap, Track
 from protocol.settings import Settings, setting
 
 _SUBMAP_NUMBERS = 1 << 16  # the header has 16 bits for the number
-_OLDEST_STATE_S = 2.0  # navigation comes once a second or oftener; a vehicle makes four metres
+_OLDEST_STATE_S = 2.0  # navigation comes once a second or oftener
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,14 +64,16 @@ class SubmapBuilder:
             self._states.append(state)
 
     def receive_ping(self, ping: Ping, state: ReckonedState) -> None:
-        """Add a ping measured at a dead-reckoned state; bad beams and pings are counted.
+        """Add a ping measured about a dead-reckoned state; bad beams and pings are counted.
 
-        A ping without a state of its time and of this sub-map has no place.
+        The vehicle went on by the state's velocity between the two. A ping without a state of its
+        time and of this sub-map has no place.
         """
         if not self._states or not abs(ping.time_s - state.time_s) <= _OLDEST_STATE_S:
             self.bad_pings += 1
             return
-        soundings_ned_m, bad = soundings_from_ping(ping, state.north_m, state.east_m, self._sonar)
+        north_m, east_m = state.position_at(ping.time_s)
+        soundings_ned_m, bad = soundings_from_ping(ping, north_m, east_m, self._sonar)
         self.bad_beams += bad
         if soundings_ned_m.size == 0:
             self.bad_pings += 1

@@ -156,6 +156,20 @@ def test_builder_closes_a_submap_at_the_end_of_its_window_and_numbers_wrap() -> 
     assert (submaps[1].bins.time_s < 16.0).all()
 
 
+@pytest.mark.parametrize("late_s", [-0.5, 0.0, 0.75])
+def test_a_ping_between_two_states_is_placed_where_the_vehicle_was(late_s: float) -> None:
+    builder = SubmapBuilder(
+        1, 0, settings=SubmapSettings(), sonar=SonarSettings(), binning=BinningSettings()
+    )
+    state = DeadReckoning(START).receive_odometry(odometry(1.0))
+    builder.receive_state(state)
+    builder.receive_ping(ping(time_s=1.0 + late_s), state)
+    builder.receive_state(dataclasses.replace(state, time_s=41.0))
+    submap = builder.take()
+    assert submap is not None
+    assert submap.bins.north_m == pytest.approx(START.north_m + 2.0 * (1.0 + late_s))
+
+
 @pytest.mark.parametrize("time_s", [4.25, 1.7e9, -1e7, np.nan])
 def test_a_ping_of_another_time_than_navigation_has_no_place(time_s: float) -> None:
     builder = SubmapBuilder(

@@ -81,14 +81,14 @@ class DeadReckoning:
             self.bad_samples += interval_s > _DOUBTED_S
             self.lost_s = interval_s
         self.is_lost = unmeasured_s > _KEPT_S
-        moved_s = 0.0 if self.is_lost else interval_s
+        sailed_mps = (0.0, 0.0) if self.is_lost else self._velocity_mps
         self.state = ReckonedState(
             time_s=odometry.time_s,
-            north_m=self.state.north_m + self._velocity_mps[0] * moved_s,
-            east_m=self.state.east_m + self._velocity_mps[1] * moved_s,
+            north_m=self.state.north_m + sailed_mps[0] * interval_s,
+            east_m=self.state.east_m + sailed_mps[1] * interval_s,
             yaw_rad=yaw_rad,
             depth_m=_finite(odometry.depth_m, self.state.depth_m),
-            velocity_mps=self._velocity_mps,
+            velocity_mps=sailed_mps,
         )
         return self.state
 

@@ -111,6 +111,7 @@ def test_a_clock_set_back_while_there_is_no_bottom_lock_leaves_the_way_unknown(
         lost_s += reckoning.lost_s
     assert lost_s == pytest.approx(95.0, abs=2.0)
     assert reckoning.state.north_m - here_m <= 20.0
+    assert reckoning.state.velocity_mps == (0.0, 0.0)
 
 
 def test_dead_reckoning_takes_single_late_samples_for_no_clock_set_back() -> None:

@@ -280,14 +280,7 @@ def run(
                 offset = rng.normal(0.0, prior_m, 2)
                 query = pair.query if kind == "own" else pair.reconstructed
                 started = time.perf_counter()
-                outcome = match(
-                    pair.reference,
-                    query,
-                    offset,
-                    np.eye(2) * prior_m**2,
-                    settings,
-                    query_reconstructed=kind == "rebuilt",
-                )
+                outcome = match(pair.reference, query, offset, np.eye(2) * prior_m**2, settings)
                 took = time.perf_counter() - started
                 error = pair.error_m(outcome.match) if outcome.match else np.zeros(2)
                 results.append((outcome, error, took))

@@ -108,7 +108,8 @@ class GriddedSubmap:
 
     Cell (i, j) lies at north0_m + i cell_m, east0_m + j cell_m. depth_m, variance_m2 and time_s
     are (R, C), NaN where nothing is known. time_s says when the cell was measured, so that drift
-    within the sub-map can be taken out.
+    within the sub-map can be taken out. reconstructed grids are what a decoder made of a packet's
+    numbers; others are the soundings themselves.
     """
 
     north0_m: float
@@ -117,3 +118,4 @@ class GriddedSubmap:
     depth_m: Array
     variance_m2: Array
     time_s: Array
+    reconstructed: bool = False

@@ -83,9 +83,7 @@ def unlimited(originals: Originals, cell_m: float) -> Rebuild:
 
     def rebuild(transfer: SubmapTransfer) -> Reconstruction:
         submap = originals.of(transfer)
-        return Reconstruction(
-            grid=grid_of(submap.bins, cell_m), track=submap.track, is_original=True
-        )
+        return Reconstruction(grid=grid_of(submap.bins, cell_m), track=submap.track)
 
     return rebuild
 

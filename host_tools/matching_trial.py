@@ -229,14 +229,7 @@ def _tree(
 
 def _match_error(pair: _Pair, grid: GriddedSubmap, settings: MatchingSettings) -> float | None:
     """Return how far a detected closure is off, or None when none is detected."""
-    outcome = match(
-        grid,
-        pair.second,
-        np.zeros(2),
-        np.eye(2) * ERROR_SIGMA_M**2,
-        settings,
-        reference_reconstructed=True,
-    )
+    outcome = match(grid, pair.second, np.zeros(2), np.eye(2) * ERROR_SIGMA_M**2, settings)
     if outcome.match is None:
         return None
     error_m = outcome.match.shift_m + pair.error_m

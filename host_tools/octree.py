@@ -120,6 +120,7 @@ def decode_octree(chunks: Sequence[bytes], track: Track) -> GriddedSubmap:
         depth_m=depth_m,
         variance_m2=np.where(np.isnan(depth_m), np.nan, LEAF_VARIANCE_M2),
         time_s=_nearest_time(depth_m, north0_m, east0_m, track),
+        reconstructed=True,
     )
 
 

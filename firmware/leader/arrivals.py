@@ -79,8 +79,7 @@ class Arrivals:
         elif not self._is_on_track(sheet_id.chain, rebuilt.track):
             self.counters["submaps_off_track"] += 1
         else:
-            lossy = not rebuilt.is_original
-            yield sheet_of(sheet_id, rebuilt.track, rebuilt.grid, reconstructed=lossy)
+            yield sheet_of(sheet_id, rebuilt.track, rebuilt.grid)
 
     def _reconstruct(self, transfer: SubmapTransfer) -> Reconstruction:
         return reconstruct_packets(transfer.fragments, self._settings, transfer.first_arrival_s)

@@ -49,7 +49,6 @@ class Sheet:
     id: SheetId
     track: Track
     grid: GriddedSubmap
-    reconstructed: bool
     time_s: float  # the middle of the measurement: the grid is warped to agree at this instant
     tiles_m: Array  # (P, 2) centres of the FOOTPRINT_M tiles that hold known cells
     centre_m: Array  # (2,) middle of them, raw dead reckoning
@@ -65,9 +64,7 @@ class Sheet:
         return grid, drift_mps
 
 
-def sheet_of(
-    sheet_id: SheetId, track: Track, grid: GriddedSubmap, *, reconstructed: bool
-) -> Sheet | None:
+def sheet_of(sheet_id: SheetId, track: Track, grid: GriddedSubmap) -> Sheet | None:
     """Return the sheet of a grid, or None if no cell of it is known."""
     rows, columns = np.nonzero(np.isfinite(grid.depth_m))
     if rows.size == 0:
@@ -80,7 +77,6 @@ def sheet_of(
         id=sheet_id,
         track=track,
         grid=grid,
-        reconstructed=reconstructed,
         time_s=float(np.nanmedian(grid.time_s)),
         tiles_m=tiles_m,
         centre_m=tiles_m.mean(axis=0),

@@ -117,8 +117,8 @@ def _evidence_of(
     overlap: Overlap, noise: NoiseModel, settings: CalibrationSettings, known: Array
 ) -> _Evidence | None:
     """Return the information that an overlap adds once shift and offset are marginalised."""
-    reference = prepare(_pure(overlap.reference, overlap.reference_swath), reconstructed=False)
-    query = prepare(_pure(overlap.query, overlap.query_swath), reconstructed=False)
+    reference = prepare(_pure(overlap.reference, overlap.reference_swath))
+    query = prepare(_pure(overlap.query, overlap.query_swath))
     if reference is None or query is None:
         return None
     fields = fields_of(reference, _SMOOTHING_CELLS), fields_of(query, _SMOOTHING_CELLS)
@@ -197,10 +197,9 @@ def _system(field: Aligned, swath: Array, settings: CalibrationSettings) -> _Sys
 
 
 def _pure(grid: GriddedSubmap, swath: Swath | None) -> GriddedSubmap:
-    """Return the grid where its across-track distance means something."""
-    if swath is None:
-        return grid
-    return replace(grid, depth_m=np.where(swath.pure, grid.depth_m, np.nan))
+    """Return the grid where its across-track distance means something, its variance whole."""
+    depth_m = grid.depth_m if swath is None else np.where(swath.pure, grid.depth_m, np.nan)
+    return replace(grid, depth_m=depth_m, reconstructed=False)
 
 
 def _basis(swath: Swath | None, grid: GriddedSubmap, cropped: GriddedSubmap) -> Array:

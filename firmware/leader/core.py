@@ -302,7 +302,7 @@ class LeaderCore:
             return
         sheet_id = SheetId(vehicle=LEADER, boot_epoch=self.boot_epoch, submap=submap.index)
         grid = grid_of(submap.bins, self._settings.reconstruction.cell_m)
-        self._add_sheet(sheet_of(sheet_id, submap.track, grid, reconstructed=False))
+        self._add_sheet(sheet_of(sheet_id, submap.track, grid))
 
     def _add_sheet(self, sheet: Sheet | None) -> None:
         if sheet is None:

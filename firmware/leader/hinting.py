@@ -130,7 +130,7 @@ def _cautious(problem: PairProblem, surface: ErrorSurface, relief: Relief, prior
     Waves longer than what the prior leaves open look alike at all of its shifts: that they fit
     would confirm the prior, whatever it says.
     """
-    is_own = not (problem.reference.reconstructed or problem.query.reconstructed)
+    is_own = not (problem.reference.grid.reconstructed or problem.query.grid.reconstructed)
     least = _WARPED_NOISE if is_own else ambiguity.LEAST_MISFIT
     scale = max(_TOLERANCE * float(surface.misfit.min()), least)
     return replace(

@@ -225,8 +225,6 @@ class Judgement:
             sigmas=sigmas,
             shift_m=shift_m,
             covariance_m2=covariance_m2,
-            reference_reconstructed=neighbours[0].reconstructed,
-            query_reconstructed=neighbours[1].reconstructed,
         )
 
 

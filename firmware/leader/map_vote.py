@@ -58,8 +58,6 @@ class VoteWindow:
     covariance_m2: Array
     matching: MatchingSettings
     sigmas: PairSigmas = ANY_PAIR
-    reference_reconstructed: bool = False
-    query_reconstructed: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,14 +108,7 @@ def carried(
 
 
 def _ratio(window: VoteWindow, settings: VoteSettings, tolerated: float) -> float:
-    problem = pair_problem(
-        window.reference,
-        window.query,
-        window.matching,
-        window.sigmas,
-        reference_reconstructed=window.reference_reconstructed,
-        query_reconstructed=window.query_reconstructed,
-    )
+    problem = pair_problem(window.reference, window.query, window.matching, window.sigmas)
     if problem is None:
         return 0.0
     surface = problem.surface()

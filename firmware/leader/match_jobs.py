@@ -64,8 +64,6 @@ class MatchJob:
             self.prior_covariance_m2,
             self.settings,
             self.sigmas,
-            reference_reconstructed=self.origin.reconstructed,
-            query_reconstructed=self.target.reconstructed,
             drifts=self.drifts,
             hinted=self.hinted,
         )

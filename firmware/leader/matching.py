@@ -48,8 +48,6 @@ def match(
     settings: MatchingSettings,
     sigmas: PairSigmas = ANY_PAIR,
     *,
-    reference_reconstructed: bool = False,
-    query_reconstructed: bool = False,
     drifts: Drifts = NO_DRIFT,
     hinted: bool = True,
 ) -> MatchOutcome:
@@ -66,14 +64,7 @@ def match(
     EstimationError
         When the grids differ in cell size or the prior is not a covariance.
     """
-    problem = pair_problem(
-        reference,
-        query,
-        settings,
-        sigmas,
-        reference_reconstructed=reference_reconstructed,
-        query_reconstructed=query_reconstructed,
-    )
+    problem = pair_problem(reference, query, settings, sigmas)
     if problem is None:
         return _none(NoMatch.EMPTY)
     prior = Prior(np.asarray(prior_shift_m), _checked(prior_covariance_m2))

@@ -59,10 +59,8 @@ class PairProblem:
     def surface_of(self, reference: GriddedSubmap, query: GriddedSubmap) -> ErrorSurface | None:
         """Return E at every lattice shift of both grids warped, None when one is empty."""
         layers = []
-        for layer, grid, charge in zip(
-            (self.reference, self.query), (reference, query), self.charges_m2, strict=True
-        ):
-            bare = prepare(grid, reconstructed=layer.reconstructed)
+        for grid, charge in zip((reference, query), self.charges_m2, strict=True):
+            bare = prepare(grid)
             if bare is None:
                 return None
             layers.append(bare.charged(*charge))
@@ -115,9 +113,6 @@ def pair_problem(
     query: GriddedSubmap,
     settings: MatchingSettings,
     sigmas: PairSigmas = ANY_PAIR,
-    *,
-    reference_reconstructed: bool,
-    query_reconstructed: bool,
 ) -> PairProblem | None:
     """Return the problem of matching two grids, None when one of them is empty.
 
@@ -134,10 +129,7 @@ def pair_problem(
             f"grids of {reference.cell_m} m and {query.cell_m} m cells cannot be matched; "
             "grid both alike"
         )
-    bare = [
-        prepare(reference, reconstructed=reference_reconstructed),
-        prepare(query, reconstructed=query_reconstructed),
-    ]
+    bare = [prepare(reference), prepare(query)]
     present = [layer for layer in bare if layer is not None]
     if len(present) < len(bare):
         return None
@@ -145,10 +137,12 @@ def pair_problem(
     fine_m2 = max(fine_relief_m2(s, settings.finest_wave_m) for s in spectra)
     slope2 = 0.5 * sum(mean_slope2(layer.grid) for layer in present)
     half_m2 = 0.5 * settings.cell_sigma_m**2 + settings.position_sigma_m**2 * slope2
-    charges_m2 = tuple((fine_m2 if layer.reconstructed else 0.0, half_m2) for layer in present)
+    charges_m2 = tuple(
+        (fine_m2 if grid.reconstructed else 0.0, half_m2) for grid in (reference, query)
+    )
     layers = [layer.charged(*charge) for layer, charge in zip(present, charges_m2, strict=True)]
     noise_m2 = sum(_per_cell(layer.noise_m2, layer) for layer in layers)
-    rebuilt_m2 = sum(_per_cell(layer.map_m2, layer) for layer in layers if layer.reconstructed)
+    rebuilt_m2 = sum(_per_cell(each.map_m2, each) for each in layers if each.grid.reconstructed)
     shared_m2 = settings.correlated_share * rebuilt_m2
     noise = noise_model(settings, shared_m2 / noise_m2, sigmas)
     offset_m2 = noise.offset_sigma_m**2

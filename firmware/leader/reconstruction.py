@@ -74,7 +74,6 @@ class Reconstruction:
     grid: GriddedSubmap
     track: Track
     recovered_points: int = 0
-    is_original: bool = False  # the soundings themselves, not what a decoder made of points
 
 
 def reconstruct_packets(
@@ -161,6 +160,7 @@ def lattice_grid(
         depth_m=depth_m,
         variance_m2=np.where(good, found.variance_m2, np.nan),
         time_s=times_of_cells(track, north_m, east_m, good),
+        reconstructed=True,
     )
 
 
@@ -213,6 +213,7 @@ def reconstruct_points(
         depth_m=depth_m,
         variance_m2=variance_m2,
         time_s=times_of_cells(track, north_m, east_m, np.isfinite(depth_m)),
+        reconstructed=True,
     )
 
 

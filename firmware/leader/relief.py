@@ -56,7 +56,7 @@ def spectrum(layer: Layer) -> Spectrum:
     if energy >= _LEAST_ENERGY:
         power = np.abs(fft.rfft2(flat * taper)) ** 2 / energy
         power = ndimage.uniform_filter(power, _BAND, mode="nearest")
-        if not layer.reconstructed:
+        if not layer.grid.reconstructed:
             power = np.maximum(power - layer.map_m2.sum() / layer.known.sum(), 0.0)
         power[0, 0] = 0.0
     return Spectrum(power_m2=power, wave=wave, total_cells=rows * cols, cell_m=cell_m)

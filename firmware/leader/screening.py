@@ -29,7 +29,6 @@ class Layer:
     weight: Array
     map_m2: Array
     noise_m2: Array
-    reconstructed: bool
 
     def charged(self, map_m2: float, difference_m2: float) -> "Layer":
         """Return the layer with more variance of its map, and of differences besides."""
@@ -83,7 +82,7 @@ class ErrorSurface:
         )
 
 
-def prepare(grid: GriddedSubmap, *, reconstructed: bool) -> Layer | None:
+def prepare(grid: GriddedSubmap) -> Layer | None:
     """Return the grid cropped to its known cells, or None if no cell is known.
 
     The variance of a reconstruction (Eq. 6) includes sigma^2 of the soundings, alike everywhere;
@@ -94,26 +93,19 @@ def prepare(grid: GriddedSubmap, *, reconstructed: bool) -> Layer | None:
     if not rows.size:
         return None
     box = (slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1))
-    cropped = GriddedSubmap(
+    cropped = dataclasses.replace(
+        grid,
         north0_m=grid.north0_m + float(rows[0]) * grid.cell_m,
         east0_m=grid.east0_m + float(cols[0]) * grid.cell_m,
-        cell_m=grid.cell_m,
         depth_m=np.where(known, grid.depth_m, np.nan)[box],
         variance_m2=np.where(known, grid.variance_m2, np.nan)[box],
         time_s=_filled(grid.time_s[box]),
     )
     mask = known[box].astype(np.float64)
-    weight = mask * np.exp(-np.nan_to_num(cropped.variance_m2)) if reconstructed else mask
+    weight = mask * np.exp(-np.nan_to_num(cropped.variance_m2)) if grid.reconstructed else mask
     variance = np.nan_to_num(cropped.variance_m2)
-    map_m2 = mask * (variance - np.nanmin(cropped.variance_m2) if reconstructed else variance)
-    return Layer(
-        grid=cropped,
-        known=mask,
-        weight=weight,
-        map_m2=map_m2,
-        noise_m2=map_m2,
-        reconstructed=reconstructed,
-    )
+    map_m2 = mask * (variance - np.nanmin(cropped.variance_m2) if grid.reconstructed else variance)
+    return Layer(grid=cropped, known=mask, weight=weight, map_m2=map_m2, noise_m2=map_m2)
 
 
 def _filled(time_s: Array) -> Array:

@@ -53,7 +53,7 @@ def packed(grid: GriddedSubmap) -> bytes:
 
 
 def unpacked(body: bytes) -> GriddedSubmap:
-    """Return the grid of bytes."""
+    """Return the grid of bytes; whether it was reconstructed is of no use to the map."""
     head = np.frombuffer(body, dtype=_HEAD, count=1)[0]
     (start_s,) = np.frombuffer(body, dtype="<f8", count=1, offset=_HEAD.itemsize)
     planes = np.frombuffer(zlib.decompress(body[_HEAD.itemsize + 8 :]), dtype=np.uint8)

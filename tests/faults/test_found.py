@@ -18,7 +18,7 @@ def test_a_grid_of_one_row_has_no_slopes_and_stops_no_match(shape: tuple[int, in
         variance_m2=np.full(shape, 0.01),
         time_s=np.zeros(shape),
     )
-    layer = prepare(grid, reconstructed=False)
+    layer = prepare(grid)
     assert layer is not None
     fields = fields_of(layer, 0.5)
     assert fields.shape == (5, *shape)

@@ -21,7 +21,6 @@ def ragged_sheet(rng: np.random.Generator, submap: int) -> Sheet:
             variance_m2=np.full_like(depth_m, 0.01),
             time_s=np.full_like(depth_m, 20.0),
         ),
-        reconstructed=False,
     )
     assert sheet is not None
     return sheet

@@ -43,7 +43,6 @@ def sheet_at(north_m: float, submap: int) -> Sheet:
         SheetId(vehicle=0, boot_epoch=0, submap=submap),
         track,
         grid_at(north_m, seed=submap),
-        reconstructed=False,
     )
     assert sheet is not None
     return sheet

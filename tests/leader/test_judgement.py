@@ -123,7 +123,6 @@ def twice_sailed() -> tuple[PoseGraph, Track, Atlas]:
                 yaw_rad=track.yaw_rad[part],
             ),
             dataclasses.replace(grid, time_s=grid.time_s + begin_s),
-            reconstructed=False,
         )
         assert sheet is not None
         atlas.add(sheet)

@@ -48,9 +48,7 @@ def _sheet(submap: int, time_s: float = 0.0) -> Sheet:
     )
     times_s = time_s + np.arange(3.0)
     track = Track(time_s=times_s, north_m=times_s, east_m=np.zeros(3), yaw_rad=np.zeros(3))
-    sheet = sheet_of(
-        SheetId(vehicle=0, boot_epoch=0, submap=submap), track, grid, reconstructed=False
-    )
+    sheet = sheet_of(SheetId(vehicle=0, boot_epoch=0, submap=submap), track, grid)
     assert sheet is not None
     return sheet
 

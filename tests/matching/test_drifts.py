@@ -46,9 +46,7 @@ def test_true_shift_fits_once_the_drift_that_it_implies_is_taken_out() -> None:
         query, north0_m=query.north0_m - TRUE_M[0], east0_m=query.east0_m - TRUE_M[1]
     )
     settings = MatchingSettings(position_sigma_m=0.1)
-    problem = pair_problem(
-        reference, query, settings, reference_reconstructed=False, query_reconstructed=False
-    )
+    problem = pair_problem(reference, query, settings)
     assert problem is not None
     plain = problem.surface()
     by_drift = screened_by_drift(problem, plain, (reference, query), LINEAR, PRIOR)
@@ -60,9 +58,7 @@ def test_true_shift_fits_once_the_drift_that_it_implies_is_taken_out() -> None:
 def test_known_drift_needs_no_second_look() -> None:
     scene = Scene(3)
     grids = scene.submap(200, 200, (41, 60)), scene.submap(210, 200, (41, 60))
-    problem = pair_problem(
-        *grids, MatchingSettings(), reference_reconstructed=False, query_reconstructed=False
-    )
+    problem = pair_problem(*grids, MatchingSettings())
     assert problem is not None
     plain, near = problem.surface(), Prior(np.zeros(2), np.eye(2))
     assert screened_by_drift(problem, plain, grids, NO_DRIFT, PRIOR) is plain
@@ -103,9 +99,7 @@ def test_query_is_warped_by_its_own_drift() -> None:
     query = dataclasses.replace(
         query, north0_m=query.north0_m - TRUE_M[0], east0_m=query.east0_m - TRUE_M[1]
     )
-    problem = pair_problem(
-        still, query, MatchingSettings(), reference_reconstructed=False, query_reconstructed=False
-    )
+    problem = pair_problem(still, query, MatchingSettings())
     assert problem is not None
     plain, own, other = problem.surface(), -np.eye(2) / APART_S, np.zeros((2, 2))
     right, wrong = (

@@ -132,7 +132,9 @@ def rebuilt(grid: GriddedSubmap, scene: Scene, sigma_m: float) -> GriddedSubmap:
     error = ndimage.gaussian_filter(scene.rng.standard_normal(grid.depth_m.shape), 2.0)
     error *= sigma_m / error.std()
     variance_m2 = np.full(grid.depth_m.shape, 1.5 * sigma_m**2)
-    return dataclasses.replace(grid, depth_m=grid.depth_m + error, variance_m2=variance_m2)
+    return dataclasses.replace(
+        grid, depth_m=grid.depth_m + error, variance_m2=variance_m2, reconstructed=True
+    )
 
 
 def misses_among_ripples(sigma_m: float, prior_m: Array, prior_sigma_m: float) -> list[float]:
@@ -155,8 +157,6 @@ def misses_among_ripples(sigma_m: float, prior_m: Array, prior_sigma_m: float) -
             prior_m[seed],
             np.eye(2) * prior_sigma_m**2,
             MatchingSettings(),
-            reference_reconstructed=True,
-            query_reconstructed=True,
         ).match
         if found is not None:
             axis = np.radians(found.axis_deg or 0.0)

@@ -14,8 +14,8 @@ NOISE = noise_model(MatchingSettings(), 0.0)
 def ends_m(seed: int) -> tuple[Array, Array]:
     """Return where a fit of two noisy sub-maps ends, and where one that begins there does."""
     scene = Scene(seed, rms_m=0.2)
-    first = prepare(scene.submap(200, 200, (61, 61), sigma_m=0.4), reconstructed=False)
-    second = prepare(scene.submap(190, 215, (61, 61), sigma_m=0.4), reconstructed=False)
+    first = prepare(scene.submap(200, 200, (61, 61), sigma_m=0.4))
+    second = prepare(scene.submap(190, 215, (61, 61), sigma_m=0.4))
     assert first is not None
     assert second is not None
     fields = fields_of(first, 0.5), fields_of(second, 0.5)

@@ -10,7 +10,7 @@ from tests.matching.scenes import Scene
 
 
 def layer_of(grid: GriddedSubmap, *, reconstructed: bool = False) -> Layer:
-    layer = prepare(grid, reconstructed=reconstructed)
+    layer = prepare(dataclasses.replace(grid, reconstructed=reconstructed))
     assert layer is not None
     return layer
 
@@ -97,4 +97,4 @@ def test_absolute_norm_is_the_mean_distance(scene: Scene) -> None:
 def test_empty_grid_has_no_layer(scene: Scene) -> None:
     grid = scene.submap(100, 100, (20, 20))
     empty = dataclasses.replace(grid, depth_m=np.full((20, 20), np.nan))
-    assert prepare(empty, reconstructed=False) is None
+    assert prepare(empty) is None

@@ -41,7 +41,7 @@ def _side(heading_rad: float) -> Side:
         time_s=np.full(shape, 20.0),
     )
     sheet_id = SheetId(vehicle=0, boot_epoch=0, submap=0)
-    sheet = sheet_of(sheet_id, track, grid, reconstructed=False)
+    sheet = sheet_of(sheet_id, track, grid)
     assert sheet is not None
     still = Trajectory(
         time_s=np.array([0.0, 40.0]),
@@ -93,8 +93,6 @@ def test_strain_blurs_a_slope_both_ways() -> None:
         plane,
         STILL,
         PairSigmas(strain_m=3.0),
-        reference_reconstructed=False,
-        query_reconstructed=False,
     )
     assert problem is not None
     surface = problem.surface()

@@ -151,7 +151,7 @@ def test_what_lies_on_the_shelf_of_a_store_is_in_the_record(
     )
     zeros = np.zeros(3)
     track = Track(time_s=np.arange(3.0), north_m=zeros, east_m=zeros, yaw_rad=zeros)
-    sheet = sheet_of(SheetId(vehicle=0, boot_epoch=0, submap=1), track, grid, reconstructed=False)
+    sheet = sheet_of(SheetId(vehicle=0, boot_epoch=0, submap=1), track, grid)
 
     def sail_and_shelve(aboard: Aboard, ticks: Iterator[float], *, on_wall: bool) -> None:
         sail(aboard, ticks, on_wall=on_wall)

@@ -16,7 +16,7 @@ from firmware.compression.results import (
     fragment_points,
 )
 from firmware.compression.settings import CompressionSettings
-from firmware.compression.steps import Watched
+from firmware.compression.steps import Steps, Watched
 from firmware.compression.track_code import USUAL_TRACK_BYTES
 from firmware.submaps import BinnedSoundings
 from protocol.lattice import PROTECTION_BYTES
@@ -84,22 +84,17 @@ def _lattice_steps(
     first = unfitted(bins, settings)
     profile = Profile.SUBMAP_LATTICE_SMALL if settings.small_frames else Profile.SUBMAP_LATTICE
     size = filled_bytes(profile, settings)
-    steps = lattice_code_steps(bins, settings.lattice_step_m, settings.frames * size)
-    while True:
-        try:
-            next(steps)
-        except StopIteration as stop:
-            code = stop.value
-            break
+    fit = Steps(lattice_code_steps(bins, settings.lattice_step_m, settings.frames * size))
+    for _ in fit:
         yield first
     if sparing:
         columns = size - PROTECTION_BYTES - USUAL_TRACK_BYTES
-        frames = chosen_frames(code, columns, settings.frames, settings)
+        frames = chosen_frames(fit.value, columns, settings.frames, settings)
         settings = dataclasses.replace(settings, frames=frames)
     yield CompressedCode(
         profile=profile,
         fragment_count=settings.frames,
-        code=code,
+        code=fit.value,
         settings=settings,
         report=FitReport(evaluations=1, ended="converged"),
     )

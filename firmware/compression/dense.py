@@ -36,6 +36,7 @@ from firmware.compression.point_code import (
 )
 from firmware.compression.settings import CompressionSettings
 from firmware.compression.smoothing import smoothed_steps
+from firmware.compression.steps import Steps
 from firmware.geometry import Array
 from firmware.submaps import BinnedSoundings
 from protocol.arithmetic import CodeEnd, Decoder, Encoder
@@ -109,14 +110,11 @@ def dense_code_steps(
         fragment = np.zeros(len(position_m), dtype=np.intp)
         return Dealing(fragment=fragment, patterns=loss_patterns(0.0, settings.frames))
 
-    steps = fit_steps(placing, count, settings, deal, settings.dense_iterations, _REACH_SHARE)
+    steps = Steps(
+        fit_steps(placing, count, settings, deal, settings.dense_iterations, _REACH_SHARE)
+    )
     draft: DenseDraft | None = None
-    while True:
-        try:
-            step = next(steps)
-        except StopIteration as stop:
-            ended = str(stop.value)
-            break
+    for step in steps:
         if step is None:
             yield None
             continue
@@ -125,7 +123,7 @@ def dense_code_steps(
     if draft is not None:
         code = yield from draft.code_steps()
         yield code, draft.fitted
-    return ended
+    return steps.value
 
 
 def _coded_steps(

@@ -13,6 +13,7 @@ from firmware.compression.kernels import Kernel
 from firmware.compression.lbfgs import Improvement, Trial, minimise_steps
 from firmware.compression.losses import LossPatterns, loss_patterns
 from firmware.compression.settings import CompressionSettings
+from firmware.compression.steps import Steps
 from firmware.geometry import Array
 from firmware.submaps import BinnedSoundings
 
@@ -190,19 +191,18 @@ def fit_steps(
     yield None
     kernel, log_b = yield from _choose(frame, start_m, dealing, settings)
     search = _Search(frame, start_m, held, dealing, kernel, log_b, reach_share)
-    steps = minimise_steps(
-        search.objective,
-        search.start,
-        evaluations=max(settings.iterations if iterations is None else iterations, 1),
-        first_move=0.2,
-        largest_move=0.5,
+    steps = Steps(
+        minimise_steps(
+            search.objective,
+            search.start,
+            evaluations=max(settings.iterations if iterations is None else iterations, 1),
+            first_move=0.2,
+            largest_move=0.5,
+        )
     )
-    while True:
-        try:
-            step = next(steps)
-        except StopIteration as stop:
-            return str(stop.value)
+    for step in steps:
         yield None if step is None else search.fitted(step)
+    return steps.value
 
 
 def moved_steps(

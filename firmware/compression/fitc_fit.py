@@ -10,6 +10,7 @@ from firmware.compression.initial import initial_point_steps
 from firmware.compression.kernels import Kernel
 from firmware.compression.lbfgs import Trial, minimise_steps
 from firmware.compression.settings import CompressionSettings
+from firmware.compression.steps import Steps
 from firmware.geometry import Array
 
 _LOG_RANGE = 12.0  # of c and sigma^2 about the variance of depth: e^-12 of it is below any noise
@@ -57,19 +58,17 @@ def fitc_steps(
     start_m, _ = yield from initial_point_steps(frame.position_m, frame.depth_m, count)
     yield None
     search, dealing = _Search(frame, start_m, settings), deal(start_m)
-    steps = minimise_steps(
-        search.objective,
-        search.start,
-        evaluations=max(settings.iterations, 1),
-        first_move=0.1,
-        largest_move=0.5,
-        tolerance=1e-5,
+    steps = Steps(
+        minimise_steps(
+            search.objective,
+            search.start,
+            evaluations=max(settings.iterations, 1),
+            first_move=0.1,
+            largest_move=0.5,
+            tolerance=1e-5,
+        )
     )
-    while True:
-        try:
-            step = next(steps)
-        except StopIteration as stop:
-            return str(stop.value)
+    for step in steps:
         if step is None:
             yield None
             continue
@@ -87,3 +86,4 @@ def fitc_steps(
             c_m2=float(np.exp(found.log_c)),
             sigma2_m2=float(np.exp(found.log_sigma2)),
         )
+    return steps.value

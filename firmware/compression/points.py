@@ -28,7 +28,7 @@ from firmware.compression.results import (
 )
 from firmware.compression.settings import CompressionSettings
 from firmware.compression.smoothing import smoothed_steps
-from firmware.compression.steps import Watched, stepping
+from firmware.compression.steps import Steps, Watched
 from firmware.geometry import Array
 from firmware.submaps import BinnedSoundings
 from protocol.errors import EstimationError
@@ -57,9 +57,11 @@ def compress_point_steps(
     expected = settings.method != "fitc"
     targets = bins
     if expected:
-        for smoothing in stepping(smoothed_steps(bins, settings.fit_cell_m)):
-            targets = smoothing or targets
+        smoothing = Steps(smoothed_steps(bins, settings.fit_cell_m))
+        for _ in smoothing:
             yield best
+        targets = smoothing.value
+        yield best
     cells = coarsened(targets, settings.fit_cell_m)
     count = min(PAPER_FRAGMENTS * PAPER_POINTS, cells.depth_m.size)
     fine = fit_frame(cells, settings.max_fit_rows)
@@ -153,9 +155,11 @@ def _pack_steps(
     mean_depth_m = float(flagged(frame.mean_depth_m, steps))
     if steps is not None:
         rounded_m = without_parity(points, steps)[:, :2] - frame.origin_m
-        for moving in stepping(moved_steps(fitted, rounded_m, frame)):
-            fitted = moving or fitted
+        moving = Steps(moved_steps(fitted, rounded_m, frame))
+        for _ in moving:
             yield before
+        fitted = moving.value
+        yield before
         points = without_parity(_absolute(fitted, frame), steps)
     hyper = Hyperparameters(
         b_per_m=fitted.b_per_m,

@@ -7,9 +7,8 @@ frames (`--profile auto`, aboard too), and that the sub-map's own code tells: ho
 byte takes away, over the frames that may be lost, beside what the soundings leave unknown anyway.
 """
 
-from math import comb
-
 from firmware.compression.lattice import LatticeCode, chosen_protection, missing_m2
+from firmware.compression.losses import arrival_chances
 from firmware.compression.settings import CompressionSettings
 
 _WORTH_IT = 1.1  # of the error of all frames at hand: what fewer may cost
@@ -32,9 +31,7 @@ def chosen_frames(code: LatticeCode, columns: int, most: int, settings: Compress
     enough_m2 = _WORTH_IT**2 * error_m2(most)
     for frames in range(1, most):
         fewest = min(settings.usable_frames, frames)
-        none = sum(
-            comb(frames, r) * (1.0 - loss) ** r * loss ** (frames - r) for r in range(fewest)
-        )
+        none = sum(arrival_chances(frames, loss)[:fewest])
         if 1.0 - none >= _MAPS and error_m2(frames) <= enough_m2:
             return frames
     return most

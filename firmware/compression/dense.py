@@ -8,7 +8,6 @@ and never more than nearly always arrive.
 import struct
 from collections.abc import Generator
 from dataclasses import dataclass
-from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +25,7 @@ from firmware.compression.fit import (
     spacing_of,
 )
 from firmware.compression.kernels import Hyperparameters, correlation, squared_distance
-from firmware.compression.losses import loss_patterns
+from firmware.compression.losses import frames_relied_on, loss_patterns
 from firmware.compression.point_code import (
     coarse_to_fine,
     decode_depths,
@@ -45,7 +44,6 @@ from protocol.lattice import PROTECTION_BYTES, Protection, bodies_of, stream_of
 
 _HEAD = struct.Struct(">4fiiHHHBB")  # hyperparameters, corner, sides, count, exponents of the steps
 _TRACK_BYTES = 46  # the longest; a straight track takes 15
-_RARELY = 0.02  # how often fewer frames may arrive than give the points
 _BITS = 17  # a point at most takes, with few exceptions: 10 for its place, 7 for its depth
 _MOST_POINTS = 600
 _MOST_PLACES = 65000.0  # along a side: two bytes
@@ -80,13 +78,6 @@ class DenseDraft:
     def code_steps(self) -> Generator[None, None, DenseCode]:
         """Code the points in small steps; the generator's value is the code."""
         return _coded_steps(self.fitted, self.frame, self.bins, self.room)
-
-
-def frames_relied_on(frames: int, loss: float) -> int:
-    """Return how many of the frames nearly always arrive, at least half of them."""
-    half = (frames + 1) // 2
-    chance = [comb(frames, r) * (1 - loss) ** r * loss ** (frames - r) for r in range(frames + 1)]
-    return max([k for k in range(half, frames + 1) if sum(chance[:k]) <= _RARELY] or [half])
 
 
 def dense_code_steps(

@@ -8,14 +8,12 @@ for the least expected error under the loss to expect (`protocol.lattice`).
 import struct
 from collections.abc import Generator
 from dataclasses import dataclass
-from math import comb
 
 import numpy as np
 
 from firmware.compression import bitplanes
 from firmware.compression.bitplanes import Progress
 from firmware.compression.calibration import heaviness, widening, without_tail
-from firmware.compression.dense import frames_relied_on
 from firmware.compression.field import Field, Trend, fitted_field_steps, fitted_trend, surface_m
 from firmware.compression.footprint import (
     Mask,
@@ -25,6 +23,7 @@ from firmware.compression.footprint import (
     footprint,
 )
 from firmware.compression.lattice_frame import LatticeFrame, interpolation, lattice_frame
+from firmware.compression.losses import arrival_chances, frames_relied_on
 from firmware.compression.settings import CompressionSettings
 from firmware.geometry import Array
 from firmware.submaps import BinnedSoundings
@@ -140,9 +139,6 @@ def chosen_protection(
     """
     loss = settings.expected_loss
     arrived = np.arange(frames + 1)
-    chance = np.array(
-        [comb(frames, r) * (1.0 - loss) ** r * loss ** (frames - r) for r in arrived.tolist()]
-    )
     at = np.array([_GEOMETRY.size + step.code_bytes for step in progress], dtype=np.float64)
     missing = np.array([step.missing_m2 for step in progress])
     k0 = min(settings.usable_frames, frames)
@@ -166,7 +162,7 @@ def chosen_protection(
     got = np.where(arrived >= k0, k0 * n0, 0) + np.where(arrived >= k1, k1 * n1, 0)
     got += np.where(arrived >= k2, k2 * (columns - n0 - n1), 0)
     error = np.interp(got, at, missing, left=4.0 * missing[0])
-    best = choices[int(np.argmin(error @ chance))]
+    best = choices[int(np.argmin(error @ arrival_chances(frames, loss)))]
     return Protection(
         thresholds=(k0, int(best[1]), int(best[3])), columns=(int(best[0]), int(best[2]))
     )
@@ -179,8 +175,8 @@ def missing_m2(
     at = [_GEOMETRY.size + step.code_bytes for step in progress]
     missing = [step.missing_m2 for step in progress]
     got = [protection.stream_bytes(columns, arrived) for arrived in range(frames + 1)]
-    chance = [comb(frames, r) * (1.0 - loss) ** r * loss ** (frames - r) for r in range(frames + 1)]
-    return float(np.dot(np.interp(got, at, missing, left=missing[0]), chance))
+    expected = np.interp(got, at, missing, left=missing[0])
+    return float(np.dot(expected, arrival_chances(frames, loss)))
 
 
 def _column_choices(columns: int, fewest: int) -> list[int]:

@@ -1,4 +1,4 @@
-"""Which frames may be lost, and how likely: the patterns that the fit is trained for."""
+"""How many frames may be lost, which, and how likely."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,6 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware.geometry import Array
+
+_RARELY = 0.02  # how often fewer frames may arrive than are relied on
+
+
+def arrival_chances(frames: int, loss: float) -> list[float]:
+    """Return how likely 0, 1 ... all of the frames arrive, each lost with the same probability."""
+    return [comb(frames, r) * (1.0 - loss) ** r * loss ** (frames - r) for r in range(frames + 1)]
+
+
+def frames_relied_on(frames: int, loss: float) -> int:
+    """Return how many of the frames nearly always arrive, at least half of them."""
+    half, chance = (frames + 1) // 2, arrival_chances(frames, loss)
+    return max([k for k in range(half, frames + 1) if sum(chance[:k]) <= _RARELY] or [half])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

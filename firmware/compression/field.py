@@ -38,24 +38,6 @@ Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Field:
-    """The estimate: coefficients (rows, columns) in m, orthonormal, about the trend."""
-
-    frame: LatticeFrame
-    trend: "Trend"
-    coefficients_m: Array
-    noise_m2: float  # of the mean of a cell, typical
-    unknown_m2: float  # of the depth at a node, that the cells leave
-
-    def depth_m(self, position_m: Array) -> Array:
-        """Return the depth at positions (N, 2)."""
-        trend_m = self.trend.depth_m(self.frame.nodes_of(position_m), self.frame)
-        nodes_m = surface_m(self.coefficients_m).ravel()
-        out: Array = interpolation(self.frame, position_m) @ nodes_m + trend_m
-        return out
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Trend:
     """A quadratic surface in the frame, in whole steps as on the wire.
 
@@ -70,6 +52,30 @@ class Trend:
         """Return the surface at fractional rows and columns (N, 2)."""
         out: Array = _quadratic(nodes, frame) @ (0.01 * 2.0**self.scale * np.array(self.terms))
         return out
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Surface:
+    """Depths in a frame: coefficients (rows, columns) in m, orthonormal, about the trend."""
+
+    frame: LatticeFrame
+    trend: Trend
+    coefficients_m: Array
+
+    def depth_m(self, position_m: Array) -> Array:
+        """Return the depth at positions (N, 2), whether measured there or not."""
+        trend_m = self.trend.depth_m(self.frame.nodes_of(position_m), self.frame)
+        nodes_m = np.asarray(idctn(self.coefficients_m, norm="ortho")).ravel()
+        out: Array = interpolation(self.frame, position_m) @ nodes_m + trend_m
+        return out
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Field(Surface):
+    """The estimate of a surface, and how well it is known."""
+
+    noise_m2: float  # of the mean of a cell, typical
+    unknown_m2: float  # of the depth at a node, that the cells leave
 
 
 def fitted_trend(bins: BinnedSoundings, frame: LatticeFrame) -> Trend:
@@ -96,7 +102,7 @@ def _quadratic(nodes: Array, frame: LatticeFrame) -> Array:
 
 
 def fitted_field_steps(
-    bins: BinnedSoundings, frame: LatticeFrame, trend: "Trend"
+    bins: BinnedSoundings, frame: LatticeFrame, trend: Trend
 ) -> Generator[None, None, Field]:
     """Estimate field and spectrum in small steps; the generator's value is the `Field`."""
     variance_m2 = _noise_of_means(bins)
@@ -133,11 +139,6 @@ def wavenumbers(frame: LatticeFrame) -> Array:
     return out
 
 
-def surface_m(coefficients_m: Array) -> Array:
-    """Return node depths about the mean from coefficients, both (rows, columns)."""
-    return np.asarray(idctn(coefficients_m, norm="ortho"))
-
-
 def _noise_of_means(bins: BinnedSoundings) -> Array:
     """Return the variance of each cell's mean; a cell's own spread is pooled with its like.
 
@@ -171,7 +172,7 @@ class _Cells:
 
     @classmethod
     def of(
-        cls, bins: BinnedSoundings, frame: LatticeFrame, trend: "Trend", weight: Array
+        cls, bins: BinnedSoundings, frame: LatticeFrame, trend: Trend, weight: Array
     ) -> "_Cells":
         position_m = np.column_stack([bins.north_m, bins.east_m])
         read = interpolation(frame, position_m).astype(np.float32)

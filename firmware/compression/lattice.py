@@ -14,7 +14,7 @@ import numpy as np
 from firmware.compression import bitplanes
 from firmware.compression.bitplanes import Progress
 from firmware.compression.calibration import heaviness, widening, without_tail
-from firmware.compression.field import Field, Trend, fitted_field_steps, fitted_trend, surface_m
+from firmware.compression.field import Field, Surface, Trend, fitted_field_steps, fitted_trend
 from firmware.compression.footprint import (
     Mask,
     block_shape,
@@ -22,10 +22,9 @@ from firmware.compression.footprint import (
     encode_footprint,
     footprint,
 )
-from firmware.compression.lattice_frame import LatticeFrame, interpolation, lattice_frame
+from firmware.compression.lattice_frame import LatticeFrame, lattice_frame
 from firmware.compression.losses import arrival_chances, frames_relied_on
 from firmware.compression.settings import CompressionSettings
-from firmware.geometry import Array
 from firmware.submaps import BinnedSoundings
 from protocol.arithmetic import CodeEnd, Decoder, Encoder
 from protocol.errors import RemoteProtocolError
@@ -36,21 +35,11 @@ _SHARE_STEPS = (0.0, 0.03, 0.06, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LatticeMap:
-    """A decoded map: coefficients, trend and footprint in their frame, and its error variance."""
+class LatticeMap(Surface):
+    """A decoded surface with its footprint, and the variance of soundings about it."""
 
-    frame: LatticeFrame
-    trend: Trend
     mask: Mask
-    coefficients_m: Array
     variance_m2: float
-
-    def depth_m(self, position_m: Array) -> Array:
-        """Return the depth at positions (N, 2), whether measured there or not."""
-        nodes = surface_m(self.coefficients_m).ravel()
-        trend_m = self.trend.depth_m(self.frame.nodes_of(position_m), self.frame)
-        out: Array = interpolation(self.frame, position_m) @ nodes + trend_m
-        return out
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -199,10 +188,8 @@ def _variance_m2(code: LatticeCode, code_bytes: int) -> float:
 def _residual_m2(field: Field, bins: BinnedSoundings) -> float:
     """Return the variance of soundings about the whole field, widened to hold 95 %."""
     position_m = np.column_stack([bins.north_m, bins.east_m])
-    depth_m = field.trend.depth_m(field.frame.nodes_of(position_m), field.frame)
-    depth_m += interpolation(field.frame, position_m) @ surface_m(field.coefficients_m).ravel()
     spread = bins.variance_m2 * np.maximum(bins.count - 1.0, 0.0)
-    every_squared = spread + (bins.depth_m - depth_m) ** 2
+    every_squared = spread + (bins.depth_m - field.depth_m(position_m)) ** 2
     squared = without_tail(every_squared)
     mean = max(float(np.average(squared, weights=bins.count)), 1e-6)
     return mean * max(widening(squared / mean, bins.count), heaviness(every_squared / mean))

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_array
 
+from firmware.compression.initial import main_axis
 from firmware.geometry import Array
 from firmware.submaps import BinnedSoundings
 
@@ -64,8 +65,7 @@ def lattice_frame(bins: BinnedSoundings, step_m: float) -> LatticeFrame:
     A side is a node or two longer where its transform would be slow.
     """
     position_m = np.column_stack([bins.north_m, bins.east_m])
-    centred_m = position_m - position_m.mean(axis=0)
-    axis = np.linalg.eigh(centred_m.T @ centred_m)[1][:, -1]
+    axis = main_axis(position_m)
     angle_code = round(np.arctan2(axis[1], axis[0]) / np.pi * _ANGLE_STEPS) % _ANGLE_STEPS
     step_q = max(1, round(4.0 * step_m))
     while True:

@@ -1,5 +1,7 @@
 """c and sigma^2 such that the leader's variance (Eq. 6) is that of soundings about its map."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.special import erf
 
@@ -26,13 +28,7 @@ def calibrated(
     """
     rows = max(512, min(_MOST_ROWS, _ROW_WORK // max(len(points_ned_m), 1) ** 2))
     every = max(1, -(-bins.depth_m.size // rows))
-    unit = Hyperparameters(
-        b_per_m=hyper.b_per_m,
-        c_m2=1.0,
-        sigma2_m2=0.0,
-        mean_depth_m=hyper.mean_depth_m,
-        kernel=hyper.kernel,
-    )
+    unit = replace(hyper, c_m2=1.0, sigma2_m2=0.0, noise_applied=False)
     decoder = point_decoder(points_ned_m, unit)
     position_m = np.column_stack([bins.north_m, bins.east_m])[::every]
     depth_m, posterior = decoder.predict(position_m)
@@ -44,16 +40,8 @@ def calibrated(
     c, sigma2 = _fitted(posterior, squared, count)
     told = c * posterior + sigma2
     wider = max(widening(squared / told, count), heaviness(every_squared / told))
-    c, sigma2 = wider * c, wider * sigma2
-    calibrated_hyper = Hyperparameters(
-        b_per_m=hyper.b_per_m,
-        c_m2=c,
-        sigma2_m2=sigma2,
-        mean_depth_m=hyper.mean_depth_m,
-        kernel=hyper.kernel,
-        noise_applied=hyper.noise_applied,
-    )
-    return calibrated_hyper, float(np.sqrt(np.mean(residual_m**2)))
+    refitted = replace(hyper, c_m2=wider * c, sigma2_m2=wider * sigma2)
+    return refitted, float(np.sqrt(np.mean(residual_m**2)))
 
 
 def _fitted(posterior: Array, squared: Array, count: Array) -> tuple[float, float]:

@@ -58,7 +58,7 @@ def cauchy(data: int, parity: int) -> Bytes:
 
 def parity_of(data: Bytes, parity: int) -> Bytes:
     """Return the parity symbols (parity, L) of data (k, L)."""
-    return _product(cauchy(len(data), parity), data)
+    return product(cauchy(len(data), parity), data)
 
 
 def recovered(
@@ -80,13 +80,14 @@ def recovered(
         )
     used = have[: missing.size]
     matrix = cauchy(len(data), len(parity))[used]
-    right = parity[used] ^ _product(matrix[:, have_data], data[have_data])
+    right = parity[used] ^ product(matrix[:, have_data], data[have_data])
     out = data.copy()
     out[missing] = _solved(matrix[:, missing].copy(), right)
     return out
 
 
-def _product(matrix: Bytes, data: Bytes) -> Bytes:
+def product(matrix: Bytes, data: Bytes) -> Bytes:
+    """Return the product in GF(2^8) of a matrix (m, k) and data (k, L)."""
     out = np.zeros((len(matrix), data.shape[1]), dtype=np.uint8)
     for column, row in zip(matrix.T, data, strict=True):
         out ^= multiply(column[:, None], row[None, :])

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from firmware.compression.results import PAPER_FRAGMENTS, PAPER_POINTS
 from firmware.geometry import Array
-from protocol.erasure import cauchy, multiply, parity_of, recovered
+from protocol.erasure import cauchy, parity_of, product, recovered
 from protocol.errors import RemoteProtocolError
 from protocol.packets import DEEPEST_M, HIGHEST_M
 
@@ -148,9 +148,7 @@ def _data_of(have: list[int], index: NDArray[np.int64], payload: Bytes) -> Bytes
     rows, checks = data.reshape(-1, _STRIPES), parity.reshape(-1, _STRIPES)
     full = recovered(rows, checks, have_data, have_parity)
     spare = have_parity[np.count_nonzero(~have_data) :]
-    expected = np.zeros((len(spare), _STRIPES), dtype=np.uint8)
-    for column, row in zip(cauchy(len(full), len(checks))[spare].T, full, strict=True):
-        expected ^= multiply(column[:, None], row[None, :])
+    expected = product(cauchy(len(full), len(checks))[spare], full)
     if not np.array_equal(expected, checks[spare]):
         raise RemoteProtocolError("the mantissas hold no parity of these points")
     return full.reshape(PAPER_FRAGMENTS, _DATA_BYTES)

@@ -14,7 +14,7 @@ import numpy as np
 from firmware.leader.settings import LeaderSettings, reassembly_of
 from protocol.acoustics import Water, WaterSettings
 from protocol.codec import decode, encode
-from protocol.packets import ExtendedAnswer, Header, Profile, SubmapFragment
+from protocol.packets import SIZE_BYTES, ExtendedAnswer, Header, Profile, SubmapFragment
 from protocol.reassembly import Reassembler, SubmapTransfer
 from protocol.repeats import FragmentQueue, RepeatSettings
 from protocol.schedule import Slots, SlotSettings
@@ -109,7 +109,7 @@ def trial(
         complete=len(done),
         fresh=sum(counter["fresh"] for counter in counters),
         repeated=sum(counter["repeated"] for counter in counters),
-        answer_bytes=answers * ExtendedAnswer.SIZE_BYTES,
+        answer_bytes=answers * SIZE_BYTES[Profile.ANSWER_EXTENDED],
         mean_delay_s=float(np.mean(delays)) if delays else float("nan"),
     )
 

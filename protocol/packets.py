@@ -3,7 +3,6 @@
 import enum
 import math
 from dataclasses import dataclass, fields
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -190,8 +189,6 @@ class SubmapPacket(_BitwiseEqual):
     c, sigma2_m2, mean depth_m, the same in all fragments; signs tell the kernel, see WIRE.md.
     """
 
-    SIZE_BYTES: ClassVar[int] = FRAME_BYTES
-
     header: Header
     trajectory: Array32
     points_ned_m: Array32
@@ -217,22 +214,13 @@ class TrajectoryPacket(_BitwiseEqual):
     east_m, yaw_rad in raw dead reckoning, one a second from the header's time; NaN unused.
     """
 
-    SIZE_BYTES: ClassVar[int] = FRAME_BYTES
-
     header: Header
     states: Array32
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Answer:
-    """The leader's estimate of a follower's position at the header's time.
-
-    `submap` is the sub-map answered; the header's fragment is the vehicle addressed and its
-    fragment_count the boot epoch in which that vehicle numbered the sub-map. The header's submap
-    is `answer_count` of the sigma and of how many answers were sent before.
-    """
-
-    SIZE_BYTES: ClassVar[int] = 22
+class _AnyAnswer:
+    """What both answers tell, and to whom."""
 
     header: Header
     submap: int
@@ -248,6 +236,16 @@ class Answer:
     def to_boot_epoch(self) -> int:
         """The boot epoch of that vehicle in which it numbered the sub-map."""
         return self.header.fragment_count
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Answer(_AnyAnswer):
+    """The leader's estimate of a follower's position at the header's time.
+
+    `submap` is the sub-map answered; the header's fragment is the vehicle addressed and its
+    fragment_count the boot epoch in which that vehicle numbered the sub-map. The header's submap
+    is `answer_count` of the sigma and of how many answers were sent before.
+    """
 
     @property
     def sigma_m(self) -> float | None:
@@ -266,19 +264,13 @@ def answer_count(sigma_m: float, sent: int) -> int:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ExtendedAnswer:
+class ExtendedAnswer(_AnyAnswer):
     """An answer with its variance, the leader's own position, and what is to be repeated.
 
     Variances are per horizontal axis in square metres; the leader's position is that at
     transmission. Bit i of missing_fragments asks for fragment i of repeat_submap; 0 asks nothing.
     """
 
-    SIZE_BYTES: ClassVar[int] = 42
-
-    header: Header
-    submap: int
-    north_m: float
-    east_m: float
     variance_m2: float
     leader_north_m: float
     leader_east_m: float
@@ -287,14 +279,9 @@ class ExtendedAnswer:
     missing_fragments: int
 
     @property
-    def to_vehicle(self) -> int:
-        """The vehicle that this answer is for."""
-        return self.header.fragment
-
-    @property
-    def to_boot_epoch(self) -> int:
-        """The boot epoch of that vehicle in which it numbered the sub-map."""
-        return self.header.fragment_count
+    def sigma_m(self) -> float:
+        """The standard deviation of the position along each axis."""
+        return math.sqrt(self.variance_m2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

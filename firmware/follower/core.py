@@ -282,19 +282,16 @@ class FollowerCore:
 
     def _receive_answer(self, answer: Answer | ExtendedAnswer, now_s: float) -> None:
         """Learn from the leader's estimate of a past state; queue what it asks for."""
-        sigma_m: float | None
         if isinstance(answer, ExtendedAnswer):
             self._outbox.request(answer.repeat_submap, answer.missing_fragments, now_s)
-            sigma_m = float(np.sqrt(answer.variance_m2)) if answer.variance_m2 > 0 else np.nan
-        else:
-            sigma_m = answer.sigma_m
         time_s = from_quarters(answer.header.time_quarters, now_s)
         track = self._known_track()
         if not track.time_s[0] <= time_s <= now_s:
             self.counters["answers_unplaceable"] += 1
             return
         answered_m = np.array([answer.north_m, answer.east_m])
-        self._correction.receive_answer(time_s, track.position_at(time_s), answered_m, sigma_m)
+        reckoned_m = track.position_at(time_s)
+        self._correction.receive_answer(time_s, reckoned_m, answered_m, answer.sigma_m)
 
     def _known_track(self) -> Track:
         return track_of([*self._track, self._reckoning.state])

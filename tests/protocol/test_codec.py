@@ -36,17 +36,6 @@ def test_construct_and_constants_agree_on_every_size(profile: Profile) -> None:
     assert FRAMES[profile].sizeof() == SIZE_BYTES[profile]
 
 
-@pytest.mark.parametrize("kind", [SubmapPacket, TrajectoryPacket, Answer, ExtendedAnswer])
-def test_size_constants_of_packets_match_their_profile(kind: type) -> None:
-    profile = {
-        SubmapPacket: Profile.SUBMAP_PAPER,
-        TrajectoryPacket: Profile.TRAJECTORY,
-        Answer: Profile.ANSWER,
-        ExtendedAnswer: Profile.ANSWER_EXTENDED,
-    }[kind]
-    assert SIZE_BYTES[profile] == kind.SIZE_BYTES  # type: ignore[attr-defined]
-
-
 @given(packets(list(Profile)))
 def test_decode_returns_what_was_encoded(packet: Packet) -> None:
     frame = encode(packet)

@@ -46,7 +46,7 @@ from firmware.submaps import BinnedSoundings, GriddedSubmap
 from protocol.codec import decode as decode_frame
 from protocol.codec import encode as encode_frame
 from protocol.errors import EstimationError
-from protocol.packets import SIZE_BYTES, Profile, SubmapFragment, SubmapPacket
+from protocol.packets import SIZE_BYTES, Fragment, Profile
 
 LOSSES = (0.0, 0.1, 0.14, 0.2)
 DRAWS = 8
@@ -70,12 +70,12 @@ TARGETS = {
 }
 
 
-def received(frames: list[bytes], lost: set[int]) -> dict[int, SubmapPacket | SubmapFragment]:
+def received(frames: list[bytes], lost: set[int]) -> dict[int, Fragment]:
     """Return the fragments that arrived, by way of the bytes."""
-    out: dict[int, SubmapPacket | SubmapFragment] = {}
+    out: dict[int, Fragment] = {}
     for index, frame in enumerate(frames):
         packet = decode_frame(frame)
-        if index not in lost and isinstance(packet, SubmapPacket | SubmapFragment):
+        if index not in lost and isinstance(packet, Fragment):
             out[index] = packet
     return out
 

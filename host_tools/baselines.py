@@ -20,7 +20,7 @@ from host_tools.octree import decode_octree, octree_submap
 from protocol.acoustics import Delivery
 from protocol.codec import decode
 from protocol.errors import ConfigError, EstimationError
-from protocol.packets import SubmapFragment, SubmapPacket
+from protocol.packets import Fragment
 from protocol.reassembly import Key, SubmapTransfer
 from protocol.vehicles import LEADER
 
@@ -105,7 +105,7 @@ class Unheard:
         if delivery.sent is None:
             return
         packet = decode(delivery.sent)
-        if delivery.destination != LEADER or not isinstance(packet, SubmapPacket | SubmapFragment):
+        if delivery.destination != LEADER or not isinstance(packet, Fragment):
             return
         header = packet.header
         key = (header.vehicle, header.boot_epoch, header.submap)

@@ -26,8 +26,8 @@ from protocol.packets import (
     FARTHEST_M,
     HIGHEST_M,
     SIZE_BYTES,
+    Fragment,
     Profile,
-    SubmapFragment,
     SubmapPacket,
 )
 from protocol.settings import replace
@@ -133,7 +133,7 @@ def reconstruct_file(frames: Path, out: Path, drop: set[int], cell_m: float) -> 
     )
 
 
-def _check_map(soundings: Path, packets: Sequence[SubmapPacket | SubmapFragment]) -> None:
+def _check_map(soundings: Path, packets: Sequence[Fragment]) -> None:
     """Raise ConfigError where small frames hold so much track that no map comes of all of them."""
     try:
         reconstruct_packets(dict(enumerate(packets)), ReconstructionSettings(), 0.0)
@@ -144,9 +144,7 @@ def _check_map(soundings: Path, packets: Sequence[SubmapPacket | SubmapFragment]
         ) from error
 
 
-def _why_no_cell(
-    fragments: dict[int, SubmapPacket | SubmapFragment], settings: ReconstructionSettings
-) -> str:
+def _why_no_cell(fragments: dict[int, Fragment], settings: ReconstructionSettings) -> str:
     """Return why a rebuilt grid is empty, and what would fill it."""
     most_m2 = settings.max_variance_m2
     uncut = replace(settings, {"max_variance_m2": _ANY_VARIANCE_M2})
@@ -214,7 +212,7 @@ def read_soundings(path: Path) -> tuple[list[Array], Track]:
     return columns, track
 
 
-def read_frames(path: Path) -> dict[int, SubmapPacket | SubmapFragment]:
+def read_frames(path: Path) -> dict[int, Fragment]:
     """Return the fragments of the one sub-map in a file of frames back to back.
 
     Raises
@@ -233,14 +231,14 @@ def read_frames(path: Path) -> dict[int, SubmapPacket | SubmapFragment]:
         size = SIZE_BYTES[Profile.SUBMAP_LATTICE_SMALL]
     if len(data) % size:
         raise ConfigError(f"{path} has {len(data)} bytes; frames have 256, small ones 62")
-    fragments: dict[int, SubmapPacket | SubmapFragment] = {}
+    fragments: dict[int, Fragment] = {}
     first = None
     for start in range(0, len(data), size):
         try:
             packet = decode(data[start : start + size])
         except RemoteProtocolError as error:
             raise ConfigError(f"{path}, frame {start // size}: {error}") from error
-        if not isinstance(packet, SubmapPacket | SubmapFragment):
+        if not isinstance(packet, Fragment):
             raise ConfigError(f"{path}, frame {start // size} is no fragment of a sub-map")
         first = packet if first is None else first
         known = fragments.setdefault(packet.header.fragment, packet)
@@ -252,7 +250,7 @@ def read_frames(path: Path) -> dict[int, SubmapPacket | SubmapFragment]:
     return fragments
 
 
-def _common(packet: SubmapPacket | SubmapFragment) -> tuple[object, ...]:
+def _common(packet: Fragment) -> tuple[object, ...]:
     """Return what all fragments of a sub-map have in common."""
     header = packet.header
     key = (header.profile, header.vehicle, header.boot_epoch, header.submap, header.fragment_count)
@@ -261,13 +259,13 @@ def _common(packet: SubmapPacket | SubmapFragment) -> tuple[object, ...]:
     return (*key, packet.body[:PROTECTION_BYTES])
 
 
-def _content(packet: SubmapPacket | SubmapFragment) -> bytes:
+def _content(packet: Fragment) -> bytes:
     """Return what a repeat of a fragment has in common with it: all but when it was sent."""
     header = dataclasses.replace(packet.header, tx_second=0)
     return encode(dataclasses.replace(packet, header=header))
 
 
-def _named(packet: SubmapPacket | SubmapFragment) -> str:
+def _named(packet: Fragment) -> str:
     header = packet.header
     return f"{header.profile.name}, vehicle {header.vehicle}, number {header.submap}"
 

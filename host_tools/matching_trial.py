@@ -28,7 +28,7 @@ from host_tools.scenario import ScenarioSettings
 from host_tools.simulator.multibeam import Multibeam, Poses
 from host_tools.simulator.placement import Site
 from protocol.errors import EstimationError
-from protocol.packets import SubmapFragment, SubmapPacket
+from protocol.packets import Fragment
 from protocol.settings import replace
 
 SUBMAP_S = 40.0
@@ -209,7 +209,7 @@ def _moved(bins: BinnedSoundings, by_m: Array) -> BinnedSoundings:
 
 
 def _rebuilt(
-    packets: Sequence[SubmapPacket | SubmapFragment], loss: float, rng: np.random.Generator
+    packets: Sequence[Fragment], loss: float, rng: np.random.Generator
 ) -> GriddedSubmap | None:
     """Return the sub-map of the packets that survive, None if nothing can be made of them."""
     arrived = {k: packet for k, packet in enumerate(packets) if rng.random() >= loss}

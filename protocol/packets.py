@@ -206,6 +206,10 @@ class SubmapFragment:
     body: bytes
 
 
+Fragment = SubmapPacket | SubmapFragment
+"""Of a sub-map, whatever its profile."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TrajectoryPacket(_BitwiseEqual):
     """A stretch of trajectory alone, sent after the survey.
@@ -294,4 +298,4 @@ class SealedFrame:
     tag: bytes
 
 
-Packet = SubmapPacket | SubmapFragment | TrajectoryPacket | Answer | ExtendedAnswer | SealedFrame
+Packet = Fragment | TrajectoryPacket | Answer | ExtendedAnswer | SealedFrame

@@ -11,11 +11,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from protocol.lattice import frames_for_all
-from protocol.packets import Profile, SubmapFragment, SubmapPacket
+from protocol.packets import Fragment, Profile, SubmapFragment
 from protocol.settings import Settings, setting
 from protocol.timestamps import QUARTERS_MODULO
 
-Fragment = SubmapPacket | SubmapFragment
 Key = tuple[int, int, int]
 """Vehicle, boot epoch, sub-map."""
 

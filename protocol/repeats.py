@@ -9,12 +9,10 @@ from collections import Counter, OrderedDict, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-from protocol.packets import MAX_FRAGMENTS, SubmapFragment, SubmapPacket
+from protocol.packets import MAX_FRAGMENTS, Fragment
 from protocol.reassembly import SUBMAPS_MODULO
 from protocol.settings import Settings, setting
 from protocol.timestamps import to_tx_second
-
-Fragment = SubmapPacket | SubmapFragment
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

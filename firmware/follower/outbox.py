@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from firmware.compression.packing import states_by_second
 from firmware.dead_reckoning import ReckonedState
 from firmware.submap_builder import track_of
-from protocol.packets import Header, Packet, Profile, SubmapFragment, SubmapPacket, TrajectoryPacket
+from protocol.packets import Fragment, Header, Packet, Profile, TrajectoryPacket
 from protocol.repeats import FragmentQueue, RepeatSettings
 from protocol.timestamps import to_quarters, to_tx_second
 
@@ -25,7 +25,7 @@ class Outbox:
         self._queue = FragmentQueue(settings)
         self._trajectory_packets = 0
 
-    def add(self, packets: Sequence[SubmapPacket] | Sequence[SubmapFragment]) -> None:
+    def add(self, packets: Sequence[Fragment]) -> None:
         """Queue a sub-map, unless half of an earlier one still waits: it would only grow old."""
         if 2 * self._queue.fresh >= max(len(packets), 2):
             self.counters["submaps_without_air"] += 1

@@ -17,7 +17,7 @@ from firmware.leader.reconstruction import (
 )
 from firmware.submaps import Track
 from protocol.errors import EstimationError
-from protocol.packets import Header, SubmapFragment, SubmapPacket, TrajectoryPacket
+from protocol.packets import Fragment, Header, SubmapPacket, TrajectoryPacket
 from protocol.reassembly import FragmentArrived, Reassembler, SubmapTransfer
 from protocol.timestamps import from_quarters
 
@@ -44,9 +44,7 @@ class Arrivals:
         self._answers, self._settings, self._rebuild = answers, settings, rebuild
         self._ranges_used_s: dict[int, float] = {}
 
-    def receive(
-        self, packet: SubmapPacket | SubmapFragment | TrajectoryPacket, now_s: float
-    ) -> None:
+    def receive(self, packet: Fragment | TrajectoryPacket, now_s: float) -> None:
         """Take a packet: states are used now, fragments wait for the next `sheets`."""
         if isinstance(packet, TrajectoryPacket):
             first_s = from_quarters(packet.header.time_quarters, now_s)
@@ -96,7 +94,7 @@ class Arrivals:
         apart_m = np.hypot(*(known.position_at(track.time_s) - reckoned_m).T)
         return bool(apart_m.max() <= _OFF_TRACK_M)
 
-    def _receive_fragment(self, fragment: SubmapPacket | SubmapFragment, now_s: float) -> None:
+    def _receive_fragment(self, fragment: Fragment, now_s: float) -> None:
         """Take the states that a fragment carries; they are of use before its sub-map is."""
         header = fragment.header
         first_s = from_quarters(header.time_quarters, now_s)

@@ -37,7 +37,7 @@ from firmware.submap_builder import SubmapBuilder
 from firmware.submaps import Submap, Track, joined
 from protocol.codec import decode, encode
 from protocol.errors import EstimationError, RemoteProtocolError
-from protocol.packets import SealedFrame, SubmapFragment, SubmapPacket, TrajectoryPacket
+from protocol.packets import Fragment, SealedFrame, TrajectoryPacket
 from protocol.reassembly import Reassembler
 from protocol.schedule import Slots, Turns
 from protocol.timestamps import is_arrival
@@ -135,7 +135,7 @@ class LeaderCore:
             self.counters[f"rejected_{error.cause}"] += 1
             return
         header = packet.header
-        if not isinstance(packet, SubmapPacket | SubmapFragment | TrajectoryPacket):
+        if not isinstance(packet, Fragment | TrajectoryPacket):
             self.counters["frames_not_for_us"] += 1
             self.counters["frames_with_our_number"] += header.vehicle == LEADER
             self.counters["frames_sealed"] += isinstance(packet, SealedFrame)

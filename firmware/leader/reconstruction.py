@@ -28,6 +28,7 @@ from protocol.errors import EstimationError, RemoteProtocolError
 from protocol.lattice import PROTECTION_BYTES
 from protocol.packets import (
     SEAL_BYTES,
+    Fragment,
     Profile,
     SubmapFragment,
     SubmapPacket,
@@ -77,7 +78,7 @@ class Reconstruction:
 
 
 def reconstruct_packets(
-    fragments: Mapping[int, SubmapPacket | SubmapFragment],
+    fragments: Mapping[int, Fragment],
     settings: ReconstructionSettings,
     near_s: float,
 ) -> Reconstruction:

@@ -20,7 +20,7 @@ from firmware.leader.reconstruction import ReconstructionSettings, reconstruct_p
 from firmware.submaps import BinnedSoundings
 from protocol.codec import decode, encode
 from protocol.errors import EstimationError, LocalProtocolError
-from protocol.packets import SubmapFragment, SubmapPacket
+from protocol.packets import Fragment, SubmapFragment, SubmapPacket
 from tests.compression.conftest import Survey, relief_m
 
 PROFILES = ("paper", "dense", "lattice")
@@ -75,11 +75,11 @@ def through_the_wire(compressed: Compressed, survey: Survey) -> dict[int, bytes]
     return {packet.header.fragment: encode(packet) for packet in packets}
 
 
-def received(frames: dict[int, bytes]) -> dict[int, SubmapPacket | SubmapFragment]:
-    out: dict[int, SubmapPacket | SubmapFragment] = {}
+def received(frames: dict[int, bytes]) -> dict[int, Fragment]:
+    out: dict[int, Fragment] = {}
     for fragment, frame in frames.items():
         packet = decode(frame)
-        assert isinstance(packet, SubmapPacket | SubmapFragment)
+        assert isinstance(packet, Fragment)
         out[fragment] = packet
     return out
 
@@ -251,9 +251,7 @@ def track_of(survey: Survey) -> bytes:
     return encode_track(survey.track)
 
 
-def fragments_of(
-    compressed: CompressedCode, bodies: list[bytes]
-) -> dict[int, SubmapPacket | SubmapFragment]:
+def fragments_of(compressed: CompressedCode, bodies: list[bytes]) -> dict[int, Fragment]:
     header = dataclasses.replace(HEADER, profile=compressed.profile, fragment_count=len(bodies))
     return {
         i: SubmapFragment(header=dataclasses.replace(header, fragment=i), body=body)
@@ -261,7 +259,7 @@ def fragments_of(
     }
 
 
-def bounded_or_refused(fragments: dict[int, SubmapPacket | SubmapFragment]) -> None:
+def bounded_or_refused(fragments: dict[int, Fragment]) -> None:
     try:
         grid = reconstruct_packets(fragments, BOUNDS, 0.0).grid
     except (EstimationError, LocalProtocolError):

@@ -6,11 +6,10 @@
 from pathlib import Path
 
 from host_tools.capture import FATES
-from protocol.layouts import body_table, fingerprint
+from protocol.layouts import fingerprint, placed_fields
 from protocol.packets import BODY_BYTES, VERSION, Profile
 
 FOLDER = Path(__file__).parent / "wireshark"
-_SIZES = {"f4": 4, "u2": 2, "byte": 1, "zero": 1}
 _COLUMNS = {
     "trajectory": "STATE",
     "states": "STATE",
@@ -45,9 +44,8 @@ def _table(entries: dict[int, str]) -> str:
 
 
 def _body(profile: Profile) -> str:
-    lines, offset = [], 0
-    for name, kind, count in body_table(profile):
-        size = _SIZES[kind] * count
+    lines = []
+    for offset, size, name, kind, count in placed_fields(profile):
         place = f"range({offset}, {size})"
         if kind == "f4" and count > 1:
             lines.append(f'floats(tree, {place}, "{name}", {_COLUMNS[name]})')
@@ -57,7 +55,6 @@ def _body(profile: Profile) -> str:
             lines.append(f'tree:add(f.number, {place}):prepend_text("{name} ")')
         else:
             lines.append(f'tree:add(f.body, {place}):prepend_text("{name} ")')
-        offset += size
     body = "\n".join(f"        {line}" for line in lines)
     return f"function(tree, range)\n{body}\n    end"
 

@@ -7,12 +7,11 @@ the file to it, compiles it and runs it against the golden vectors.
 from pathlib import Path
 
 from protocol.crc import crc32c
-from protocol.layouts import body_table, fingerprint
+from protocol.layouts import body_table, fingerprint, placed_fields
 from protocol.packets import BODY_BYTES, VERSION, Profile
 
 FOLDER = Path(__file__).parent / "c"
 _C_TYPES = {"f4": "float", "u2": "uint16_t", "byte": "uint8_t"}
-_SIZES = {"f4": 4, "u2": 2, "byte": 1, "zero": 1}
 _MUST_BE_FINITE = ("north_m", "east_m", "leader_north_m", "leader_east_m")
 
 
@@ -44,18 +43,9 @@ def _name(profile: Profile) -> str:
     return f"fl_{profile.name.lower()}"
 
 
-def _fields(profile: Profile) -> list[tuple[int, str, str, int]]:
-    """Return (offset, name, type, count) of a body's rows."""
-    found, offset = [], 0
-    for name, kind, count in body_table(profile):
-        found.append((offset, name, kind, count))
-        offset += _SIZES[kind] * count
-    return found
-
-
 def _struct(profile: Profile) -> str:
     rows = []
-    for _, name, kind, count in _fields(profile):
+    for name, kind, count in body_table(profile):
         if kind != "zero":
             rows.append(f"    {_C_TYPES[kind]} {name}{f'[{count}]' if count > 1 else ''};")
     return f"struct {_name(profile)} {{\n" + "\n".join(rows) + "\n};"
@@ -68,7 +58,7 @@ def _case(profile: Profile, lines: list[str]) -> str:
 
 def _reads(profile: Profile) -> list[str]:
     lines = [f"struct {_name(profile)} *to = &body->{profile.name.lower()};"]
-    for offset, name, kind, count in _fields(profile):
+    for offset, _, name, kind, count in placed_fields(profile):
         if kind == "f4":
             target = f"to->{name}" if count > 1 else f"&to->{name}"
             lines.append(f"fl_get_f4(at + {offset}, {target}, {count});")
@@ -88,7 +78,7 @@ def _reads(profile: Profile) -> list[str]:
 
 def _writes(profile: Profile) -> list[str]:
     lines = [f"const struct {_name(profile)} *from = &body->{profile.name.lower()};"]
-    for offset, name, kind, count in _fields(profile):
+    for offset, _, name, kind, count in placed_fields(profile):
         if kind == "f4":
             source = f"from->{name}" if count > 1 else f"&from->{name}"
             lines.append(f"fl_put_f4(at + {offset}, {source}, {count});")

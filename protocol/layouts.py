@@ -5,6 +5,7 @@ the test of WIRE.md. The CRC is a plain field, checked outside.
 """
 
 import hashlib
+from collections.abc import Iterator
 
 import construct as c
 
@@ -65,6 +66,7 @@ BODIES: dict[Profile, BodyTable] = {
 """Every other profile has one row: its body as bytes, read by `firmware.compression`."""
 
 _TYPES = {"f4": c.Float32b, "u2": c.Int16ub, "byte": c.Byte, "zero": c.Const(0, c.Byte)}
+_SIZES = {"f4": 4, "u2": 2, "byte": 1, "zero": 1}
 
 HEADER = c.BitStruct(*(name / c.BitsInteger(bits) for name, bits in HEADER_FIELDS))
 SEAL = c.Struct("counter" / c.Int32ub, "tag" / c.Bytes(8))
@@ -74,6 +76,15 @@ CRC = c.Int32ul
 def body_table(profile: Profile) -> BodyTable:
     """Return the rows of a profile's body."""
     return BODIES.get(profile, (("body", "byte", BODY_BYTES[profile]),))
+
+
+def placed_fields(profile: Profile) -> Iterator[tuple[int, int, str, str, int]]:
+    """Yield (offset, bytes, name, type, repetitions) of a body's rows."""
+    offset = 0
+    for name, kind, count in body_table(profile):
+        size = _SIZES[kind] * count
+        yield offset, size, name, kind, count
+        offset += size
 
 
 def frame_layout(profile: Profile) -> c.Struct:

@@ -130,11 +130,8 @@ def encode_body(packet: Packet) -> bytes:
         return packet.body
     try:
         if isinstance(packet, SubmapPacket) and plain is Profile.SUBMAP_PAPER:
-            points = (
-                POINTS_PER_SEALED_FRAGMENT
-                if packet.header.profile.is_sealed
-                else (POINTS_PER_FRAGMENT)
-            )
+            is_sealed = packet.header.profile.is_sealed
+            points = POINTS_PER_SEALED_FRAGMENT if is_sealed else POINTS_PER_FRAGMENT
             return (
                 _floats(packet.trajectory, (STATES_PER_FRAGMENT, 3))
                 + _floats(packet.points_ned_m, (points, 3))

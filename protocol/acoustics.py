@@ -114,18 +114,12 @@ class Delivery:
 
 @dataclass(frozen=True, slots=True)
 class _Arrival:
-    """A frame on its way to one receiver, with the draws already made."""
+    """A frame that sounds at its receiver, what becomes of it if nothing else does, and an echo."""
 
-    source: int
-    destination: int
-    t_tx_s: float
+    delivery: Delivery
     begins_s: float
     ends_s: float
-    measured_s: float
-    fate: str
-    frame: bytes
     echo: bool
-    sent: bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,8 +192,7 @@ class Water:
         """Return the fates decided up to and including a time, oldest first, lost ones too."""
         deliveries = []
         while self._queue and self._queue[0][0] <= time_s:
-            decided_s, _, arrival = heapq.heappop(self._queue)
-            deliveries.append(self._decide(arrival, decided_s))
+            deliveries.append(self._decide(heapq.heappop(self._queue)[2]))
         return deliveries
 
     def travel_time_s(self, source: int, destination: int, t_tx_s: float) -> float:
@@ -218,6 +211,7 @@ class Water:
         settings = self.settings
         link = (source, destination)
         travel_s = self.travel_time_s(source, destination, now_s)
+        begins_s, ends_s = now_s + travel_s, now_s + travel_s + duration_s
         is_outlier = self._draw("outlier", link).random() < settings.outlier_share
         noise_m = settings.range_noise_m * self._draw("noise", link).standard_normal()
         factor = settings.outlier_factor if is_outlier else 1.0
@@ -232,21 +226,18 @@ class Water:
         if travel_s * settings.sound_speed_mps > settings.reach_m:
             fate = "out-of-reach"
         else:
-            interval = _Interval(source, now_s + travel_s, now_s + travel_s + duration_s)
-            self._heard[destination].append(interval)
-        arrival = _Arrival(
-            source,
-            destination,
-            now_s,
-            now_s + travel_s,
-            now_s + travel_s + duration_s,
-            measured_s,
-            fate,
-            damaged if fate == "corrupt" else frame,
-            has_echo and fate in {"delivered", "corrupt"},
-            frame,
+            self._heard[destination].append(_Interval(source, begins_s, ends_s))
+        delivery = Delivery(
+            source=source,
+            destination=destination,
+            t_tx_s=now_s,
+            t_rx_s=measured_s,
+            t_delivered_s=max(begins_s, measured_s) + duration_s,
+            frame=damaged if fate == "corrupt" else frame,
+            fate=fate,
+            sent=frame,
         )
-        self._push(max(arrival.begins_s, measured_s) + duration_s, arrival)
+        self._push(_Arrival(delivery, begins_s, ends_s, has_echo))
 
     def _late_s(self, node: int, now_s: float) -> float:
         """Return by how much a node's clock is behind that of node 0."""
@@ -254,31 +245,26 @@ class Water:
             return 0.0
         return 1e-3 * self.settings.clock_offset_ms + 1e-6 * self.settings.clock_drift_ppm * now_s
 
-    def _decide(self, arrival: _Arrival, decided_s: float) -> Delivery:
+    def _decide(self, arrival: _Arrival) -> Delivery:
         """Return the fate, now that everything that could sound at the same time has begun."""
-        fate = arrival.fate
+        delivery, fate = arrival.delivery, arrival.delivery.fate
         if fate not in {"duplicate", "out-of-reach"}:
-            if _overlaps(arrival, self._own[arrival.destination]):
+            if _overlaps(arrival, self._own[delivery.destination]):
                 fate = "half-duplex"
-            elif _overlaps(arrival, self._heard[arrival.destination]):
+            elif _overlaps(arrival, self._heard[delivery.destination]):
                 fate = "collision"
-        received = fate in {"delivered", "corrupt", "duplicate"}
-        if received and arrival.echo:
+        if fate not in {"delivered", "corrupt", "duplicate"}:
+            return replace(delivery, t_rx_s=None, fate=fate)
+        if arrival.echo and delivery.t_rx_s is not None:
             delay_s = self.settings.echo_delay_s
             echo = replace(
-                arrival, measured_s=arrival.measured_s + delay_s, fate="duplicate", echo=False
+                delivery,
+                t_rx_s=delivery.t_rx_s + delay_s,
+                t_delivered_s=delivery.t_delivered_s + delay_s,
+                fate="duplicate",
             )
-            self._push(decided_s + delay_s, echo)
-        return Delivery(
-            source=arrival.source,
-            destination=arrival.destination,
-            t_tx_s=arrival.t_tx_s,
-            t_rx_s=arrival.measured_s if received else None,
-            t_delivered_s=decided_s,
-            frame=arrival.frame,
-            fate=fate,
-            sent=arrival.sent,
-        )
+            self._push(replace(arrival, delivery=echo, echo=False))
+        return delivery
 
     def _is_lost(self, link: tuple[int, int]) -> bool:
         """Draw a loss, independent or by the Gilbert-Elliott state of this directed link."""
@@ -322,9 +308,9 @@ class Water:
             self._generators[key] = np.random.default_rng(seed)
         return self._generators[key]
 
-    def _push(self, decided_s: float, arrival: _Arrival) -> None:
+    def _push(self, arrival: _Arrival) -> None:
         self._sequence += 1
-        heapq.heappush(self._queue, (decided_s, self._sequence, arrival))
+        heapq.heappush(self._queue, (arrival.delivery.t_delivered_s, self._sequence, arrival))
 
     def _forget(self, before_s: float) -> None:
         for sounds in (*self._own.values(), *self._heard.values()):
@@ -334,7 +320,7 @@ class Water:
 
 def _overlaps(arrival: _Arrival, sounds: list[_Interval]) -> bool:
     """Return whether any other sound falls into the arrival's time at its receiver."""
-    itself = (arrival.source, arrival.begins_s)
+    itself = (arrival.delivery.source, arrival.begins_s)
     return any(
         sound.begins_s < arrival.ends_s
         and sound.ends_s > arrival.begins_s

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from protocol.lattice import frames_for_all
-from protocol.packets import Fragment, Profile, SubmapFragment
+from protocol.packets import Fragment, SubmapFragment
 from protocol.settings import Settings, setting
 from protocol.timestamps import QUARTERS_MODULO
 
@@ -79,7 +79,6 @@ class SubmapTransfer:
     vehicle: int
     boot_epoch: int
     submap: int
-    profile: Profile
     fragment_count: int
     fragments: Mapping[int, Fragment]
     first_arrival_s: float
@@ -90,11 +89,6 @@ class SubmapTransfer:
     def is_complete(self) -> bool:
         """Whether all fragments arrived."""
         return len(self.fragments) == self.fragment_count
-
-    @property
-    def missing(self) -> tuple[int, ...]:
-        """The indices of the fragments that did not arrive."""
-        return tuple(i for i in range(self.fragment_count) if i not in self.fragments)
 
 
 ReassemblyEvent = FragmentArrived | SubmapTransfer
@@ -262,7 +256,6 @@ class Reassembler:
                 vehicle=vehicle,
                 boot_epoch=boot_epoch,
                 submap=submap,
-                profile=slot.first.header.profile,
                 fragment_count=slot.first.header.fragment_count,
                 fragments=dict(sorted(slot.fragments.items())),
                 first_arrival_s=slot.first_arrival_s,

@@ -15,7 +15,6 @@ from host_tools.simulator.placement import place_survey
 from host_tools.simulator.terrain import open_terrain
 from host_tools.simulator.vehicle import SimulatedVehicle
 from protocol.errors import EstimationError
-from protocol.packets import Profile
 from protocol.reassembly import SubmapTransfer
 from protocol.schedule import Slots, SlotSettings
 from protocol.settings import replace
@@ -40,7 +39,6 @@ def transfer(submap: int, arrived: set[int]) -> SubmapTransfer:
         vehicle=1,
         boot_epoch=0,
         submap=submap,
-        profile=Profile.SUBMAP_PAPER,
         fragment_count=10,
         fragments=dict.fromkeys(arrived),  # type: ignore[arg-type]
         first_arrival_s=50.0,

@@ -1,7 +1,5 @@
 """One link trial: faults, then quiet; what is believed is what was said, and all is well again."""
 
-import traceback
-
 import numpy as np
 
 from host_tools.faults.catalogue import plan_of
@@ -26,7 +24,7 @@ class LinkTrial:
     """Both link programs under the plan of a seed."""
 
     def __init__(self, seed: int) -> None:
-        self.seed, self.plan = seed, plan_of(seed, FIRST_S, SPAN_S)
+        self.plan = plan_of(seed, FIRST_S, SPAN_S)
         self.ledger = Ledger()
         self.most_bytes = 0
         self._slots = Slots(SlotSettings())
@@ -42,23 +40,7 @@ class LinkTrial:
 
     def run(self) -> Outcome:
         """Return what the trial came to."""
-        violations, recovered_s = self.ledger.violations, None
-        try:
-            recovered_s = self._sail()
-        except Exception:
-            violations.append("escaped: " + traceback.format_exc(limit=-2).replace("\n", " | "))
-        else:
-            violations += self._final()
-            if recovered_s is None:
-                violations.append(f"not well again {RECOVERY_S:g} s after the last fault")
-        return Outcome(
-            seed=self.seed,
-            violations=tuple(violations),
-            fired=dict(self.plan.fired),
-            digest=self.rig.digest(),
-            recovered_s=recovered_s,
-            deaths=sum(computer.deaths for computer in self.rig.computers),
-        )
+        return self.rig.outcome(self._sail, self._lost_fragments, self.ledger.violations)
 
     def _sail(self) -> float | None:
         """Return how long after the last fault a sub-map was complete and an answer heard."""
@@ -73,14 +55,13 @@ class LinkTrial:
             now_s += 1.0
         return None
 
-    def _final(self) -> list[str]:
+    def _lost_fragments(self) -> list[str]:
         leader = self.rig.computers[0].program
         if isinstance(leader, LinkLeader):
             leader.reassembler.flush()
             leader.collect()
         lost = self.ledger.placed - self.ledger.closed
-        wrong = [f"{lost} accepted fragments came out of no transfer"] if lost else []
-        return [*wrong, *self.rig.wrong_seals()]
+        return [f"{lost} accepted fragments came out of no transfer"] if lost else []
 
     def _look(self) -> None:
         for vehicle, computer in enumerate(self.rig.computers):

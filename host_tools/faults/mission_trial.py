@@ -3,7 +3,6 @@
 import logging
 import math
 import tempfile
-import traceback
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -98,7 +97,7 @@ class MissionTrial:
     """Both vehicles under the plan of a seed, with their stores in a folder."""
 
     def __init__(self, seed: int, survey: Survey, folder: Path) -> None:
-        self.seed, self.plan = seed, plan_of(seed, FIRST_S, SPAN_S)
+        self.plan = plan_of(seed, FIRST_S, SPAN_S)
         self.violations: list[str] = []
         self.most_bytes = 0
         self._survey, self._folder = survey, folder
@@ -113,26 +112,11 @@ class MissionTrial:
 
     def run(self) -> Outcome:
         """Return what the trial came to."""
-        recovered_s = None
-        try:
-            recovered_s = self._sail()
-        except Exception:
-            self.violations.append("escaped: " + traceback.format_exc().replace("\n", " | "))
-        else:
-            self.violations += self.rig.wrong_seals()
-            if recovered_s is None:
-                self.violations.append(f"not well again {RECOVERY_S:g} s after the last fault")
+        outcome = self.rig.outcome(self._sail, list, self.violations)
         for computer in self.rig.computers:
             if computer.program is not None:
                 computer.program.abandon()
-        return Outcome(
-            seed=self.seed,
-            violations=tuple(self.violations),
-            fired=dict(self.plan.fired),
-            digest=self.rig.digest(),
-            recovered_s=recovered_s,
-            deaths=sum(computer.deaths for computer in self.rig.computers),
-        )
+        return outcome
 
     def _sail(self) -> float | None:
         """Return how long after the last fault a new sub-map was placed and an answer used."""

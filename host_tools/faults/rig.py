@@ -1,6 +1,7 @@
 """Two computers, their modems and the water between them, under one plan of faults."""
 
 import hashlib
+import traceback
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -32,6 +33,8 @@ CLOCK_AT_ZERO_S = 50_000_000
 
 Start = Callable[[int, SealedModem, Fate, float], Program]
 """Vehicle, modem, fate and local time, to a program that has just been started."""
+Sail = Callable[[], float | None]
+"""Lets all time pass; returns how long after the last fault all was well again, None for never."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,7 +73,7 @@ class Rig:
         position_of: Callable[[int, float], Position],
         start: Start,
     ) -> None:
-        self.plan, self.now_s = plan, 0.0
+        self.seed, self.plan, self.now_s = seed, plan, 0.0
         self._digest = hashlib.sha256()
         rngs = [np.random.default_rng([seed, k]) for k in range(6)]
         self.medium = FaultyMedium(
@@ -87,13 +90,25 @@ class Rig:
         for computer in self.computers:
             computer.step(now_s)
 
-    def digest(self) -> str:
-        """Return a fingerprint of all that crossed the water so far."""
-        return self._digest.hexdigest()[:16]
-
-    def wrong_seals(self) -> list[str]:
-        """Return what is wrong with seals: a frame opened twice, a counter used twice."""
-        return [*self._opened_twice(), *self._used_twice()]
+    def outcome(self, sail: Sail, final: Callable[[], list[str]], violations: list[str]) -> Outcome:
+        """Sail, and return what came of it; what final and the seals find wrong is added."""
+        recovered_s = None
+        try:
+            recovered_s = sail()
+        except Exception:
+            violations.append("escaped: " + traceback.format_exc().replace("\n", " | "))
+        else:
+            violations += [*final(), *self._opened_twice(), *self._used_twice()]
+            if recovered_s is None:
+                violations.append(f"not well again {RECOVERY_S:g} s after the last fault")
+        return Outcome(
+            seed=self.seed,
+            violations=tuple(violations),
+            fired=dict(self.plan.fired),
+            digest=self._digest.hexdigest()[:16],
+            recovered_s=recovered_s,
+            deaths=sum(computer.deaths for computer in self.computers),
+        )
 
     def _opened_twice(self) -> list[str]:
         return [

@@ -28,6 +28,7 @@ from host_tools.simulator.vehicle import SimulatedVehicle
 from protocol.acoustics import Delivery
 from protocol.errors import EstimationError
 from protocol.settings import flatten
+from protocol.vehicles import name_of
 
 # Covariances are asked for this often: they change slowly and cost a solve each.
 COVARIANCE_STEP = 20
@@ -110,7 +111,7 @@ def mission_result(
         leader_record(bare(leader.core), time_s, mission.site.window),
         {
             "leader": leader.core.status(),
-            **{f"follower_{node.core.vehicle}": node.core.status() for node in followers},
+            **{name_of(node.core.vehicle): node.core.status() for node in followers},
         },
     )
 

@@ -9,6 +9,7 @@ from firmware.journaled import Journaled
 from firmware.leader.journaled import JournaledLeader
 from host_tools.mission_settings import MissionSettings
 from host_tools.nodes import FollowerNode, LeaderNode
+from host_tools.processes.resume import prepare_store
 from host_tools.simulator.vehicle import SimulatedVehicle
 from protocol.errors import ConfigError
 from protocol.schedule import Slots
@@ -27,10 +28,7 @@ def stored_nodes(
     ConfigError
         When the folder cannot be made or holds stores: a simulation cannot take up an earlier one.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"--store {folder}: {error.strerror}; give a folder of yours") from error
+    prepare_store(folder)
     if any(folder.glob("*.sqlite")):
         raise ConfigError(
             f"--store {folder} holds the stores of an earlier mission; give a new folder "

@@ -37,7 +37,7 @@ def live_errors(settings: MissionSettings, terrain: Path | None, seed: int) -> S
     spans = math.ceil(settings.scenario.duration_min / SPAN_MIN)
     rows = []
     for vehicle in result.vehicles:
-        true_m = np.column_stack([vehicle.truth.north_m, vehicle.truth.east_m])
+        true_m = vehicle.truth.position_m
         miss_m = np.hypot(*(vehicle.live_m - true_m).T)
         rows.append([part.mean() for part in np.array_split(miss_m[1:], spans)])
     return Spans(names=[vehicle.name for vehicle in result.vehicles], error_m=np.array(rows))

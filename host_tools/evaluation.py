@@ -121,7 +121,7 @@ def _position_m2(result: MissionResult) -> Array:
 
 def vehicle_errors(vehicle: VehicleResult, survey_s: float) -> VehicleErrors:
     """Return the errors of one vehicle's estimates."""
-    truth_m = np.stack([vehicle.truth.north_m, vehicle.truth.east_m], axis=1)
+    truth_m = vehicle.truth.position_m
     sailed_m = np.hypot(*np.diff(truth_m, axis=0, prepend=truth_m[:1]).T)
     reckoned_m = np.hypot(*(vehicle.dead_reckoning_m - truth_m).T)
     during = vehicle.truth.time_s <= survey_s
@@ -183,21 +183,10 @@ def judge_closures(
 ) -> list[JudgedClosure]:
     """Return the closures beside the true displacement of the states that they link."""
     truths = {vehicle.vehicle: vehicle.truth for vehicle in vehicles}
-
-    def at(vehicle: int, time_s: float) -> Array:
-        truth = truths[vehicle]
-        return np.array(
-            [
-                np.interp(time_s, truth.time_s, truth.north_m),
-                np.interp(time_s, truth.time_s, truth.east_m),
-            ]
-        )
-
     judged = []
     for closure in closures:
-        true_m = at(closure.to_vehicle, closure.to_time_s) - at(
-            closure.from_vehicle, closure.from_time_s
-        )
+        from_m = truths[closure.from_vehicle].position_at(closure.from_time_s)
+        true_m = truths[closure.to_vehicle].position_at(closure.to_time_s) - from_m
         error_m = np.array([closure.measured_north_m, closure.measured_east_m]) - true_m
         if closure.axis_deg is None:
             size_m = float(np.hypot(*error_m))

@@ -192,8 +192,8 @@ def _submap(
     ranges_m, _ = sonar.measure(poses)
     bins = SoundingBins(BinningSettings())
     for k in range(len(time_s)):
-        one = Poses(**{name: getattr(poses, name)[k : k + 1] for name in Poses.__slots__})
-        bins.add(sonar.soundings(one, ranges_m[k : k + 1]), time_s[k])
+        one = slice(k, k + 1)
+        bins.add(sonar.soundings(poses.part(one), ranges_m[one]), time_s[k])
     whole = np.isclose(time_s % 1.0, 0.0)
     track = Track(
         time_s=time_s[whole],

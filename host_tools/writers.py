@@ -112,7 +112,7 @@ def write_trajectories(vehicle: VehicleResult, datum: Datum, folder: Path) -> No
     measured = np.zeros_like(true_attitude)
     measured[:, 0] = vehicle.yaw_rad
     tracks = (
-        (np.stack([truth.north_m, truth.east_m], axis=1), true_attitude),
+        (truth.position_m, true_attitude),
         (vehicle.dead_reckoning_m, measured),
         (vehicle.live_m, measured),
         (vehicle.final_m, measured),

@@ -73,7 +73,7 @@ def errors_over_time(result: MissionResult) -> Figure:
     """Return horizontal errors of dead reckoning, live and final, with the stated 2 sigma."""
     figure, panels = _panels(len(result.vehicles), 3.8)
     for axes, vehicle in zip(panels, result.vehicles, strict=True):
-        truth_m = np.stack([vehicle.truth.north_m, vehicle.truth.east_m], axis=1)
+        truth_m = vehicle.truth.position_m
         minutes = vehicle.truth.time_s / 60.0
         tracks = (
             ("dead reckoning", vehicle.dead_reckoning_m, None),
@@ -158,21 +158,13 @@ def closures(result: MissionResult, evaluation: Evaluation) -> Figure:
     for truth in truths.values():
         plan.plot(truth.east_m, truth.north_m, color="#b0b0b0", lw=0.8)
     active = [judged for judged in evaluation.closures if judged.closure.active_at_end]
-    lines = []
-    for judged in active:
-        ends = []
-        for vehicle, time_s in (
-            (judged.closure.from_vehicle, judged.closure.from_time_s),
-            (judged.closure.to_vehicle, judged.closure.to_time_s),
-        ):
-            truth = truths[vehicle]
-            ends.append(
-                (
-                    float(np.interp(time_s, truth.time_s, truth.east_m)),
-                    float(np.interp(time_s, truth.time_s, truth.north_m)),
-                )
-            )
-        lines.append(ends)
+    lines = [
+        [
+            truths[judged.closure.from_vehicle].position_at(judged.closure.from_time_s)[::-1],
+            truths[judged.closure.to_vehicle].position_at(judged.closure.to_time_s)[::-1],
+        ]
+        for judged in active
+    ]
     colours = [VALID if judged.is_valid else FALSE for judged in active]
     plan.add_collection(LineCollection(lines, colors=colours, linewidths=1.0))
     plan.set_aspect("equal", adjustable="datalim")

@@ -28,6 +28,10 @@ class Poses:
     pitch_rad: Array
     yaw_rad: Array
 
+    def part(self, pings: NDArray[np.bool_] | slice) -> "Poses":
+        """Return the poses of some of the pings."""
+        return Poses(**{name: getattr(self, name)[pings] for name in self.__slots__})
+
 
 def beam_angles(scenario: ScenarioSettings) -> Array:
     """Return the beams' angles (B,) from the vertical, positive to starboard."""

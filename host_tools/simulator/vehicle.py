@@ -31,6 +31,16 @@ class TrueTrack:
     pitch_rad: Array
     yaw_rad: Array
 
+    @property
+    def position_m(self) -> Array:
+        """North and east (T, 2)."""
+        return np.stack([self.north_m, self.east_m], axis=1)
+
+    def position_at(self, time_s: float) -> Array:
+        """Return north and east (2,) at a time, held constant beyond the ends."""
+        axes_m = (self.north_m, self.east_m)
+        return np.array([np.interp(time_s, self.time_s, axis_m) for axis_m in axes_m])
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Chunk:
@@ -200,10 +210,9 @@ class SimulatedVehicle:
 
     def _with_ranges(self, chunk: _Chunk, poses: Poses) -> _Chunk:
         at = chunk.is_ping
-        pinged = Poses(**{name: getattr(poses, name)[at] for name in Poses.__slots__})
         ranges_m = np.full((len(at), len(self._sonar.angles_rad)), np.nan)
         fliers = np.zeros(ranges_m.shape, dtype=np.bool_)
-        ranges_m[at], fliers[at] = self._sonar.measure(pinged)
+        ranges_m[at], fliers[at] = self._sonar.measure(poses.part(at))
         if self._on_soundings is not None:
             used = ~fliers & (chunk.time_s <= self._survey_s)[:, None]
             self._on_soundings(self._sonar.soundings(poses, np.where(used, ranges_m, np.nan)))

@@ -35,7 +35,7 @@ def vehicle_result(
     live_off_m: tuple[float, float], final_off_m: tuple[float, float], vehicle: int = 0
 ) -> VehicleResult:
     truth = straight_track()
-    truth_m = np.stack([truth.north_m, truth.east_m], axis=1)
+    truth_m = truth.position_m
     return VehicleResult(
         vehicle=vehicle,
         truth=truth,

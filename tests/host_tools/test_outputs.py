@@ -68,7 +68,7 @@ def sailed(
         if odometry.time_s % 1 == 0:
             reckoned[int(odometry.time_s)], yaw[int(odometry.time_s)] = at, odometry.yaw_rad
     truth = simulated.true_track()
-    truth_m = np.stack([truth.north_m, truth.east_m], axis=1)
+    truth_m = truth.position_m
     points_m = np.concatenate(soundings)
     off_m = (reckoned - truth_m)[0]
     still = np.zeros(len(points_m))

@@ -9,7 +9,6 @@ without the AES suite, listening.
 
 import hashlib
 import hmac
-from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -120,17 +119,11 @@ class Sealer:
 
 
 class Opener:
-    """Decoded packets in, verified packets out; for one vehicle, with a window per sender.
-
-    `rejects` counts by cause: plain (not sealed), reflected (our own), elsewhere (for another
-    vehicle), tag (forged, altered or of another key), replay, stale (behind the window), layout.
-    """
+    """Decoded packets in, verified packets out; for one vehicle, with a window per sender."""
 
     def __init__(
         self, own: int, keys: Keys, marks: Marks | None = None, suite: Suite | None = None
     ) -> None:
-        self.rejects: Counter[str] = Counter()
-        self.accepted = 0
         self._own, self._keys, self._marks = own, keys, marks
         self._suite = suite or Blake2sSuite()
         loaded = marks.load() if marks is not None else {}
@@ -147,17 +140,10 @@ class Opener:
         Raises
         ------
         RemoteProtocolError
-            For everything else, counted in `rejects` by its `cause`.
+            For everything else; its `cause` is plain (not sealed), reflected (our own), elsewhere
+            (for another vehicle), tag (forged, altered or of another key), replay, stale (behind
+            the window) or layout.
         """
-        try:
-            opened = self._open(packet)
-        except RemoteProtocolError as error:
-            self.rejects[error.cause] += 1
-            raise
-        self.accepted += 1
-        return opened
-
-    def _open(self, packet: Packet) -> Packet:
         header = packet.header
         sender = header.vehicle
         if not isinstance(packet, SealedFrame):

@@ -116,7 +116,6 @@ def test_an_altered_frame_with_a_sound_crc_never_passes(data: st.DataObject) -> 
     opener = Opener(0, KEYS)
     with pytest.raises(RemoteProtocolError):
         opener.open(decode(with_crc(bytes(frame))))
-    assert opener.accepted == 0
 
 
 def forge(count: int) -> int:
@@ -160,7 +159,7 @@ def test_none_of_a_million_forged_altered_replayed_or_reflected_frames_is_accept
     assert forge(1_000_000) == 0
 
 
-def test_rejects_are_counted_by_cause() -> None:
+def test_rejects_tell_their_cause() -> None:
     leader, follower = Opener(0, KEYS), Opener(1, KEYS)
     frame = sealed_frame()
     leader.open(decode(frame))
@@ -170,8 +169,6 @@ def test_rejects_are_counted_by_cause() -> None:
     assert cause(Opener(2, KEYS), frame) == "elsewhere"
     assert cause(leader, with_crc(frame[:-5] + bytes([frame[-5] ^ 1]))) == "tag"
     assert cause(Opener(0, Keys(bytes(32))), frame) == "tag"
-    assert leader.rejects == {"replay": 1, "plain": 1, "tag": 1}
-    assert leader.accepted == 1
 
 
 def test_each_direction_has_its_own_key() -> None:
@@ -303,7 +300,6 @@ def test_counters_of_a_lost_store_begin_at_the_clock() -> None:
     files.texts.clear()
     again = Sealer(KEYS, ReservedCounter(Path("c"), floor=1040, files=files))
     opener.open(decode(again.seal(follower_packet())))
-    assert opener.accepted == 10
 
 
 def key_file(tmp_path: Path, text: bytes, mode: int = 0o600) -> Path:

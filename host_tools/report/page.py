@@ -98,8 +98,10 @@ def _error_table(evaluation: Evaluation) -> str:
     head = ("", "mean", "RMS", "largest", "at the end", "of dead reckoning", "of distance", "NEES")
     rows = []
     for name, errors in evaluation.vehicles.items():
+        surveyed = errors.live_during_survey
         kinds = (
             ("live", errors.live),
+            *([] if surveyed == errors.live else [("live during its survey", surveyed)]),
             ("final", errors.final),
             ("dead reckoning", errors.dead_reckoning),
         )

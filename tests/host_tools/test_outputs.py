@@ -249,6 +249,25 @@ def test_report_is_one_file_that_needs_no_other(mission: MissionResult, tmp_path
     assert not re.search(r"<(script|link)\b", page)
 
 
+def test_report_tells_live_errors_of_the_survey_where_it_ends_before_the_mission(
+    mission: MissionResult, tmp_path: Path
+) -> None:
+    evaluation = evaluate(mission)
+    errors = evaluation.vehicles["follower_1"]
+    surveyed = dataclasses.replace(errors.live, mean_m=77.77)
+    evaluation = dataclasses.replace(
+        evaluation,
+        vehicles={
+            "leader": dataclasses.replace(errors, live_during_survey=errors.live),
+            "follower_1": dataclasses.replace(errors, live_during_survey=surveyed),
+        },
+    )
+    write_report(mission, evaluation, tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert 'follower 1, live during its survey</td><td class="n">77.77 m' in page
+    assert "leader, live during" not in page
+
+
 def test_panels_of_a_fleet_are_no_wider_than_the_page() -> None:
     deliveries = [dataclasses.replace(delivery(0.0), destination=to) for to in range(5)]
     figure = link(deliveries, 600.0)

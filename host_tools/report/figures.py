@@ -124,8 +124,8 @@ def maps(result: MissionResult, evaluation: Evaluation) -> Figure:
     shown = panels[0].imshow(depth_m, origin="lower", extent=extent, cmap="viridis_r")
     figure.colorbar(shown, ax=panels[0], label="depth in mission datum (m)", shrink=0.8)
     if min(depth_m.shape) > 1:  # one row or column has no slope
-        shade = _hillshade(depth_m, window.cell_north_m, window.cell_east_m)
-        panels[0].imshow(shade, origin="lower", extent=extent, cmap="gray", alpha=0.35)
+        shadow = _shadow(depth_m, window.cell_north_m, window.cell_east_m)
+        panels[0].imshow(np.zeros((*shadow.shape, 3)), origin="lower", extent=extent, alpha=shadow)
     for vehicle in result.vehicles:
         panels[0].plot(vehicle.final_m[:, 1], vehicle.final_m[:, 0], color="white", lw=0.7)
     panels[0].set_title("map of the final estimate, final tracks")
@@ -138,17 +138,21 @@ def maps(result: MissionResult, evaluation: Evaluation) -> Figure:
     )
     panels[1].set_title("registration error (grey: not in both maps)")
     panels[1].set_facecolor("#c8c8c8")  # no error is nearly white
+    panels[1].sharex(panels[0])
+    panels[1].sharey(panels[0])
     for axes in panels:
         axes.set(xlabel="east (m)", ylabel="north (m)")
     return figure
 
 
-def _hillshade(depth_m: Array, cell_north_m: float, cell_east_m: float) -> Array:
+def _shadow(depth_m: Array, cell_north_m: float, cell_east_m: float) -> Array:
+    """Return how dark each cell is, 0 to 1: flat ground, and what faces the light, is 0."""
     north, east = np.gradient(-depth_m, cell_north_m, cell_east_m)
     light = np.array([0.5, -0.5, 0.7])
     lit = light[2] - light[0] * 5.0 * north - light[1] * 5.0 * east
-    shade: Array = lit / np.sqrt(1.0 + 25.0 * (north**2 + east**2))
-    return shade
+    lit /= np.sqrt(1.0 + 25.0 * (north**2 + east**2))
+    shadow: Array = np.clip(np.nan_to_num(light[2] - lit), 0.0, 1.0)
+    return shadow
 
 
 def closures(result: MissionResult, evaluation: Evaluation) -> Figure:

@@ -268,6 +268,16 @@ def test_report_tells_live_errors_of_the_survey_where_it_ends_before_the_mission
     assert "leader, live during" not in page
 
 
+def test_flat_ground_has_the_colours_of_the_bar(mission: MissionResult) -> None:
+    evaluation = evaluate(mission)
+    slope_m = np.full_like(evaluation.map_depth_m, 30.0)
+    slope_m[: len(slope_m) // 2] += 0.5 * np.arange(slope_m.shape[1])
+    figure = maps(mission, dataclasses.replace(evaluation, map_depth_m=slope_m))
+    shadow = np.asarray(figure.axes[0].images[1].get_alpha())
+    assert np.all(shadow[len(slope_m) // 2 + 1 :] == 0.0)
+    assert np.all(shadow[: len(slope_m) // 2 - 1] > 0.0)
+
+
 def test_panels_of_a_fleet_are_no_wider_than_the_page() -> None:
     deliveries = [dataclasses.replace(delivery(0.0), destination=to) for to in range(5)]
     figure = link(deliveries, 600.0)

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from firmware.geometry import Array
 from host_tools.evaluation import VALID_CLOSURE_M, Evaluation, JudgedClosure
@@ -174,6 +175,11 @@ def closures(result: MissionResult, evaluation: Evaluation) -> Figure:
     plan.set_aspect("equal", adjustable="datalim")
     plan.set(title=f"{len(active)} active closures at the end", xlabel="east (m)")
     plan.set_ylabel("north (m)")
+    judgements = ((VALID, f"within {VALID_CLOSURE_M:g} m of the truth"), (FALSE, "farther off"))
+    key = [
+        Line2D([], [], color=colour, marker="o", ms=4, label=says) for colour, says in judgements
+    ]
+    figure.legend(handles=key, loc="outside lower center", ncols=len(key), fontsize=8)
     _strip(strip, evaluation.closures)
     return figure
 
@@ -192,7 +198,8 @@ def _strip(axes: Axes, closures: Sequence[JudgedClosure]) -> None:
     labels = [f"{name}\n{len(members)}" for name, members in groups.items()]
     axes.set_xticks(range(len(groups)), labels)
     axes.axhline(VALID_CLOSURE_M, color="#808080", lw=0.8, ls="--")
-    axes.set(yscale="log", ylim=(0.04, 600.0), ylabel="error (m)")
+    axes.set(xlim=(-0.5, len(groups) - 0.5), ylabel="error (m)")
+    axes.set(yscale="log", ylim=(0.04, 600.0))
     axes.set_title("error of every closure by the last stage it passed")
     axes.grid(alpha=0.25)
 

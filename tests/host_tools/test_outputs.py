@@ -18,7 +18,7 @@ from host_tools.evaluation import (
 from host_tools.mapping import DepthMap
 from host_tools.registration import TileShifts
 from host_tools.report import write_report
-from host_tools.report.figures import link, maps
+from host_tools.report.figures import closures, link, maps
 from host_tools.results import MissionResult, SoundingPatch, VehicleResult
 from host_tools.scenario import ScenarioSettings, named_scenario
 from host_tools.simulate import outcome_lines
@@ -266,6 +266,16 @@ def test_report_tells_live_errors_of_the_survey_where_it_ends_before_the_mission
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert 'follower 1, live during its survey</td><td class="n">77.77 m' in page
     assert "leader, live during" not in page
+
+
+def test_closures_have_a_key_of_their_colours(mission: MissionResult) -> None:
+    figure = closures(mission, evaluate(mission))
+    (key,) = figure.legends
+    assert [text.get_text() for text in key.get_texts()] == [
+        "within 5 m of the truth",
+        "farther off",
+    ]
+    assert figure.axes[1].get_xlim() == (-0.5, 3.5)
 
 
 def test_flat_ground_has_the_colours_of_the_bar(mission: MissionResult) -> None:

@@ -57,7 +57,10 @@ def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
         help="paper-1, paper-2, field-1, day-1, or a file of scenario keys (default: %(default)s)",
     )
     parser.add_argument(
-        "--loss", type=float, metavar="P", help="share of frames lost per receiver, both ways"
+        "--loss",
+        type=float,
+        metavar="P",
+        help="share of frames lost per receiver, both ways; default: that of the scenario",
     )
     parser.add_argument(
         "--set",

@@ -325,25 +325,43 @@ def _write(path: Path, data: bytes) -> None:
 
 def _configure_compress(parser: argparse.ArgumentParser) -> None:
     profile = FollowerSettings().profile
-    parser.add_argument("soundings", type=Path, metavar="SOUNDINGS.npz")
+    parser.add_argument(
+        "soundings",
+        type=Path,
+        metavar="SOUNDINGS.npz",
+        help=f"arrays {', '.join(_SOUNDINGS)}; with a track also {', '.join(_TRACK)}",
+    )
     parser.add_argument(
         "--profile",
         choices=CHOICES,
         default=profile,
         help=f"default: {profile}; auto: lattice in as few of the frames as do about as well",
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="FRAMES.bin")
     parser.add_argument(
-        "--frames", type=int, metavar="N", help="dense and lattice; default: 10; of auto the most"
+        "--out", type=Path, required=True, metavar="FRAMES.bin", help="frames back to back"
+    )
+    parser.add_argument(
+        "--frames",
+        type=int,
+        metavar="N",
+        help="how many, for dense and lattice, or at most, for auto; default: 10",
     )
     parser.add_argument("--small", action="store_true", help="lattice in frames of 62 bytes")
 
 
 def _configure_reconstruct(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("frames", type=Path, metavar="FRAMES.bin")
-    parser.add_argument("--drop", default="", metavar="I,J", help="fragments lost, from 0")
-    parser.add_argument("--cell", type=float, default=1.0, metavar="M", help="default: 1.0")
-    parser.add_argument("--out", type=Path, required=True, metavar="GRID.npz")
+    parser.add_argument("frames", type=Path, metavar="FRAMES.bin", help="what compress wrote")
+    parser.add_argument("--drop", default="", metavar="I,J", help="fragments to leave out, from 0")
+    parser.add_argument(
+        "--cell", type=float, default=1.0, metavar="M", help="of the grid, in metres; default: 1.0"
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="GRID.npz",
+        help="arrays north_m, east_m, depth_m (rows north), variance_m2",
+    )
 
 
 def _run_compress(arguments: argparse.Namespace) -> None:

@@ -145,7 +145,11 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         "--seeds", type=count, default=5, metavar="N", help="seeds 1 to N; default 5"
     )
     parser.add_argument(
-        "--pairs", type=count, default=PAIRS, metavar="N", help=f"of Figure 8; default {PAIRS}"
+        "--pairs",
+        type=count,
+        default=PAIRS,
+        metavar="N",
+        help=f"pairs of sub-maps for Figure 8; default {PAIRS}",
     )
     parser.add_argument(
         "--out", type=folder_of, metavar="DIR", help="write the figures there as well"
@@ -183,7 +187,7 @@ def _trial(terrain: Path | None, pairs: int) -> TrialResult:
 
 COMMAND = Command(
     name="reproduce",
-    help="rerun section 6 of the paper and print its figures beside",
+    help="rerun section 6 of the paper and print its figures beside ours",
     configure=_configure,
     run=_run,
 )

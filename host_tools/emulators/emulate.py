@@ -9,11 +9,19 @@ from host_tools.emulators.run import KINDS, EmulationSettings, emulate
 
 def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("kind", choices=KINDS, help="the dialect that the modems speak")
-    parser.add_argument("--nodes", type=count, default=2, help="how many modems")
     parser.add_argument(
-        "--range", type=float, default=500.0, metavar="M", help="metres between neighbours"
+        "--nodes", type=count, default=2, metavar="N", help="how many modems; default: %(default)s"
     )
-    parser.add_argument("--seed", type=seed, default=1, help="of loss and noise")
+    parser.add_argument(
+        "--range",
+        type=float,
+        default=500.0,
+        metavar="M",
+        help="metres between neighbours; default: %(default)g",
+    )
+    parser.add_argument(
+        "--seed", type=seed, default=1, metavar="N", help="of loss and noise; default: %(default)s"
+    )
 
 
 def _run(arguments: argparse.Namespace) -> None:

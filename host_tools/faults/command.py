@@ -96,7 +96,12 @@ def _one(trial: Trial, plan: Plan, number: int) -> Outcome:
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--tier", choices=("link", "mission"), default="link")
+    parser.add_argument(
+        "--tier",
+        choices=("link", "mission"),
+        default="link",
+        help="link: without fit and graph; mission: short surveys (default: %(default)s)",
+    )
     parser.add_argument("--seeds", type=count, default=1000, metavar="N", help="default: 1000")
     parser.add_argument("--first", type=seed, default=0, metavar="N", help="first seed (default 0)")
     parser.add_argument("--seed", type=seed, metavar="N", help="this seed alone, with its faults")

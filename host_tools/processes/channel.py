@@ -187,7 +187,13 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--ports", type=Path, metavar="DIR", help="where the ports' names go (default: /tmp)"
     )
-    parser.add_argument("--out", type=folder_of, default=Path("out/channel"), metavar="DIR")
+    parser.add_argument(
+        "--out",
+        type=folder_of,
+        default=Path("out/channel"),
+        metavar="DIR",
+        help="where the outputs go (default: %(default)s)",
+    )
     parser.add_argument("--no-report", action="store_true", help="leave report.html out")
 
 

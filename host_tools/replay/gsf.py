@@ -172,7 +172,11 @@ def ping_s(ping: dict[str, Any]) -> float:
 def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", type=Path, metavar="FILE.gsf", help="a GSF log")
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="SOUNDINGS.npz", help="for compress"
+        "--out",
+        type=Path,
+        required=True,
+        metavar="SOUNDINGS.npz",
+        help="soundings that compress reads",
     )
 
 

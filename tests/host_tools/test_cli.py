@@ -1,12 +1,15 @@
+import argparse
 import json
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from host_tools.cli import main
+from host_tools.command_line import build_parser
 from host_tools.commands import status_of
 from protocol.codec import encode
 from protocol.packets import Answer, Header, Profile, SubmapPacket
@@ -257,3 +260,18 @@ def test_an_error_of_the_system_without_a_file_is_one_line(
 
     assert status_of("benchmarks.days", full) == 2
     assert capsys.readouterr().err == "benchmarks.days: no space left\n"
+
+
+def arguments_of(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.Action]]:
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for below in action.choices.values():
+                yield from arguments_of(below)
+        else:
+            yield parser.prog, action
+
+
+def test_help_says_what_every_argument_is() -> None:
+    arguments = list(arguments_of(build_parser()))
+    assert len(arguments) > 50
+    assert [(prog, action.dest) for prog, action in arguments if not action.help] == []

@@ -2,8 +2,12 @@
 
 from math import nan
 
+import numpy as np
+
 from benchmarks.accuracy import ACTIVE, FALSE, FAR, table, total
 from benchmarks.compression import OURS, frames_of
+from benchmarks.matching import report
+from firmware.leader.matches import Match, MatchOutcome
 
 
 def test_closures_of_all_seeds_are_added_up() -> None:
@@ -23,3 +27,22 @@ def test_losses_are_drawn_over_the_frames_that_travel() -> None:
     assert frames_of("lattice, 10 x 62 B", 620) == 10
     assert frames_of("lattice, 2 frames", 512) == 2
     assert frames_of("octree", 1000) == 10
+
+
+def test_a_line_of_matches_says_that_errors_are_those_of_valid_closures() -> None:
+    found = Match(
+        shift_m=np.zeros(2),
+        covariance_m2=np.eye(2),
+        residual=0.0,
+        misfit=1.0,
+        overlap_cells=100,
+        axis_deg=None,
+        centre_m=np.zeros(2),
+        reference_time_s=0.0,
+        query_time_s=0.0,
+    )
+    results = [
+        (MatchOutcome(match=found, reason=None), np.array([north_m, 0.0]), 0.01)
+        for north_m in (2.0, 50.0)
+    ]
+    assert "found   2 valid   1, of these RMS  2.00 m NEES  4.00" in report("rough", results)

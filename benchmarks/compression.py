@@ -359,7 +359,9 @@ def against_gpytorch(window: Window) -> dict[str, float]:
 
 def main() -> None:
     """Run what the arguments ask for; print tables, write the JSON."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.compression", description=__doc__.splitlines()[0]
+    )
     parser.add_argument("--per-site", type=int, default=2)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--json", type=Path, default=None)

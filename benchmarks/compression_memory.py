@@ -1,4 +1,4 @@
-"""Peak memory of binning and fitting so many soundings, above the process after its imports.
+"""Peak memory in MiB of binning and fitting so many soundings, above that after the imports.
 
 python -m benchmarks.compression_memory 3000000 paper
 """

@@ -140,7 +140,7 @@ def _print_stores(folder: Path, settings: MissionSettings, site: Site, seed: int
 
 def main() -> None:
     """Run both missions and compare."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.kills", description=__doc__)
     parser.add_argument("--kills", type=count, default=50)
     add_survey_arguments(parser)
     add_seed_argument(parser)

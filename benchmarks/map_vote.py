@@ -3,7 +3,8 @@
     python -m benchmarks.map_vote --closures 40 --seed 1 [--relief rough,gentle]
 
 Three sub-maps of either line, one after the other; a closure between the middle ones, right to a
-metre or wrong by 8 to 60 m, carries its neighbours along, which then vote.
+metre or wrong by 8 to 60 m, carries its neighbours along, which then vote. A vote is a logarithm
+of a likelihood ratio: above 0 it supports the closure, below 0 it contradicts it, 0 abstains.
 """
 
 import argparse
@@ -60,7 +61,7 @@ def windows(
 
 def main() -> None:
     """Print the quantiles of the vote for valid and invalid closures, and their overlap."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.map_vote", description=__doc__)
     parser.add_argument("--closures", type=int, default=40)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--relief", default="rough,gentle,ripples,flat," + ",".join(TERRAINS))
@@ -97,7 +98,7 @@ def main() -> None:
         right = np.quantile(valid, [0.05, 0.5, 0.95])
         wrong = np.quantile(invalid, [0.05, 0.5, 0.95])
         print(
-            f"{kind:12s} valid {np.round(right, 1)} invalid {np.round(wrong, 1)} "
+            f"{kind:12s} votes at 5, 50, 95 %: valid {np.round(right, 1)} invalid {np.round(wrong, 1)} "
             f"| valid contradicted {np.mean(np.array(valid) < 0):.2f} "
             f"invalid supported {np.mean(np.array(invalid) > 0):.2f} "
             f"abstained {np.mean(np.array(valid) == 0):.2f} | {1e3 * np.median(took_s):.0f} ms",

@@ -98,7 +98,8 @@ def main() -> None:
         right = np.quantile(valid, [0.05, 0.5, 0.95])
         wrong = np.quantile(invalid, [0.05, 0.5, 0.95])
         print(
-            f"{kind:12s} votes at 5, 50, 95 %: valid {np.round(right, 1)} invalid {np.round(wrong, 1)} "
+            f"{kind:12s} votes at 5, 50, 95 %: valid {np.round(right, 1)} "
+            f"invalid {np.round(wrong, 1)} "
             f"| valid contradicted {np.mean(np.array(valid) < 0):.2f} "
             f"invalid supported {np.mean(np.array(invalid) > 0):.2f} "
             f"abstained {np.mean(np.array(valid) == 0):.2f} | {1e3 * np.median(took_s):.0f} ms",

@@ -170,6 +170,8 @@ def read_soundings(path: Path) -> tuple[list[Array], Track]:
         When the file is no npz of these arrays, or they disagree.
     """
     try:
+        if path.is_file() and not zipfile.is_zipfile(path):
+            raise ConfigError(f"{path} is no npz; give one such as replay or numpy.savez writes")
         with path.open("rb") as stream, np.load(stream) as data:
             names = [name for name in (*_SOUNDINGS, *_TRACK) if name in data.files]
             arrays = {name: data[name].astype(np.float64, casting="same_kind") for name in names}

@@ -226,6 +226,12 @@ def load_scenario(name_or_path: str) -> ScenarioSettings:
     water = table.pop("water", {})
     if not isinstance(water, dict):
         raise ConfigError(f"{path}: water is {water!r}; write its keys under [water]")
+    foreign = [key for key, value in table.items() if isinstance(value, dict)]
+    if foreign:
+        raise ConfigError(
+            f"{path}: a scenario file holds the keys of scenario, without that word, and [water]; "
+            f"what is of {foreign[0]!r} goes by --set"
+        )
     table |= {f"water.{key}": value for key, value in water.items()}
     try:
         scenario = replace(base, {"name": path.stem, **table})

@@ -146,5 +146,5 @@ def _read(name: str, value: object, kind: Any) -> object:  # noqa: ANN401
             raise ValueError
         return kind(value)
     except (TypeError, ValueError, OverflowError) as error:
-        wanted = getattr(kind, "__name__", str(kind))
-        raise ConfigError(f"{name} is {value!r}; give a value of type {wanted}") from error
+        wanted = {int: "a whole number", float: "a number"}.get(kind, "text")
+        raise ConfigError(f"{name} is {value!r}; give {wanted}") from error

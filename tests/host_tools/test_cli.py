@@ -113,7 +113,7 @@ def test_sound_profile_is_shown_as_it_is_set(
         (["--set", "depth_of_field=3"], "unknown setting 'depth_of_field'"),
         (["--set", "duratoin_min=3"], "did you mean scenario.duration_min?"),
         (["--set", "leg_m"], "is not KEY=VALUE"),
-        (["--set", "leg_m=long"], "give a value of type float"),
+        (["--set", "leg_m=long"], "give a number"),
         (["--loss", "1.5"], "must be at most 1"),
         (
             ["--set", "slots.followers=3"],
@@ -123,9 +123,9 @@ def test_sound_profile_is_shown_as_it_is_set(
         (["--set", "line_spacing_m=inf"], "line_spacing_m is inf; give a finite number in m"),
         (["--set", "corner_offset_m=-inf"], "corner_offset_m is -inf; give a finite number"),
         (["--set", "line_spacing_m=nan"], "line_spacing_m is nan; give a finite number in m"),
-        (["--set", "leader.atlas_submaps=inf"], "give a value of type int"),
+        (["--set", "leader.atlas_submaps=inf"], "give a whole number"),
         (["--set", f"{PROFILE}=0,1500,50"], "give pairs of depth in m and speed in m/s"),
-        (["--set", f"{PROFILE}=0,1500,50,fast"], "give a value of type float"),
+        (["--set", f"{PROFILE}=0,1500,50,fast"], "give a number"),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(

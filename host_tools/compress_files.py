@@ -337,7 +337,7 @@ def _configure_compress(parser: argparse.ArgumentParser) -> None:
         "--profile",
         choices=CHOICES,
         default=profile,
-        help=f"default: {profile}; auto: lattice in as few of the frames as do about as well",
+        help=f"default: {profile}; auto: lattice in the fewest frames that do about as well",
     )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="FRAMES.bin", help="frames back to back"

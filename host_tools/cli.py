@@ -9,8 +9,12 @@ from collections.abc import Sequence
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one subcommand; return 0, or 2 with one line on stderr that says what is wrong.
 
+    A standard stream that is closed becomes the null device, lest a file be opened in its place.
     Ctrl-C while modules are imported ends the process at once, in one line as well.
     """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w" if number else "r", encoding="utf-8"))
     is_heeded = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if is_heeded:  # in the background it may be ignored
         signal.signal(signal.SIGINT, _end)

@@ -71,6 +71,18 @@ def test_a_command_interrupted_while_it_is_imported_says_so_in_one_line() -> Non
     assert done.stderr == b"fathomlink: interrupted\n"
 
 
+def test_a_closed_stream_is_the_null_device_and_no_file_of_a_mission(tmp_path: Path) -> None:
+    taken = tmp_path / "taken"
+    program = (
+        "import os, sys; os.close(1); sys.stdout = None; from host_tools.cli import main; "
+        f"status = main(['config', 'show']); stream = open({str(taken)!r}, 'w'); "
+        "os.write(1, b'from a library'); sys.exit(status)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert taken.read_bytes() == b""
+
+
 def test_config_show_lists_settings_with_units_and_reasons(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

@@ -169,6 +169,18 @@ def test_unreadable_arguments_are_one_line_and_status_2(
     assert capsys.readouterr().err.count("\n") == 1
 
 
+@pytest.mark.parametrize("command", [["simulate", "--out", "x"], ["config", "show"]])
+def test_an_unknown_argument_points_to_the_help_of_its_subcommand(
+    command: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main([*command, "--seeds", "3"])
+    of = " ".join(part for part in command if part not in {"--out", "x"})
+    assert f"unrecognized arguments: --seeds 3 (try fathomlink {of} --help)" in (
+        capsys.readouterr().err
+    )
+
+
 @pytest.mark.parametrize(
     "command", ["simulate", "demo", "channel", "follower", "leader", "reproduce"]
 )

@@ -60,7 +60,7 @@ def _check(field: "dataclasses.Field[Any]", value: object) -> None:
     if isinstance(value, float) and not math.isfinite(value):
         of_it = f" in {unit}" if unit else ""
         raise ConfigError(f"{field.name} is {value}; give a finite number{of_it}")
-    shown = f"{field.name} is {value} {unit}".rstrip()
+    shown = f"{field.name} is {value} {'as a share' if unit == 'share' else unit}".rstrip()
     if minimum is not None and value < minimum:
         raise ConfigError(f"{shown}; it must be at least {minimum}")
     if maximum is not None and value > maximum:

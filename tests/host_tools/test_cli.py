@@ -132,6 +132,7 @@ def test_sound_profile_is_shown_as_it_is_set(
             "slots have 3 followers, the scenario has 1; give followers=3",
         ),
         (["--set", "followers=2", "--set", "slots.followers=1"], "give followers=1"),
+        (["--loss", "14"], "loss is 14.0 as a share; it must be at most 1.0"),
         (["--set", "line_spacing_m=inf"], "line_spacing_m is inf; give a finite number in m"),
         (["--set", "corner_offset_m=-inf"], "corner_offset_m is -inf; give a finite number"),
         (["--set", "line_spacing_m=nan"], "line_spacing_m is nan; give a finite number in m"),

@@ -5,6 +5,11 @@ import time
 from collections.abc import Iterator
 from typing import Protocol
 
+LEAP_S = 10.0
+"""A clock that goes on by more at once was set: no step of a loop takes so long."""
+DOUBTED_S = 600.0
+"""A leap past the mission's end is believed after this time: until then it may be set right."""
+
 
 class Clock(Protocol):
     """Mission time, in seconds since the start that all vehicles share."""
@@ -21,7 +26,8 @@ class WallClock:
 
     Ticks are whole periods. One that passes while the loop is still busy, or that the clock leaps
     over, is left out and counted: a late step must not be followed by a burst of later ones. Where
-    the clock is set back, ticks go on from what it then shows.
+    the clock is set back, ticks go on from what it then shows. One that leaps past the mission's
+    end ends it only if it stays there.
     """
 
     def __init__(self, start_utc_s: float, end_s: float = math.inf) -> None:
@@ -39,20 +45,29 @@ class WallClock:
             wait_s = step * period_s - self.now_s()
             if wait_s > 0.0:
                 time.sleep(min(wait_s, period_s))  # no longer: the clock may be set meanwhile
-                due = self._due_step(period_s)
+                due = self._doubted_step(step, period_s)
                 if abs(due - step) > 1:  # it was; one that is only slewed is waited for
                     self.set_back += due < step
                     self.skipped += max(0, due - step)
                     step = due
                 continue
             yield step * period_s
-            following = max(step + 1, self._due_step(period_s))
+            following = max(step + 1, self._doubted_step(step, period_s))
             self.skipped += following - step - 1
             step = following
 
     def status(self) -> dict[str, int]:
         """Return the counters: ticks left out, and how often the clock was set back."""
         return {"clock_ticks_skipped": self.skipped, "clock_set_back": self.set_back}
+
+    def _doubted_step(self, step: int, period_s: float) -> int:
+        """Return the period that is due after a step; wait while only a leap has ended them all."""
+        latest = max(self._end_s / period_s, step + LEAP_S / period_s)
+        for _ in range(math.ceil(DOUBTED_S / period_s)):
+            if self._due_step(period_s) <= latest:
+                break
+            time.sleep(period_s)
+        return self._due_step(period_s)
 
     def _due_step(self, period_s: float) -> int:
         """Return which whole period ends now or next, none before the start."""

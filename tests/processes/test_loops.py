@@ -4,7 +4,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from firmware.clock import WallClock
+from firmware.clock import DOUBTED_S, WallClock
 from firmware.executive import Executive, Task
 from firmware.follower.core import FollowerCore
 from firmware.follower.loop import FollowerLoop
@@ -307,6 +307,28 @@ def test_a_wall_clock_that_leaps_ahead_gives_no_burst_and_no_tick_of_the_past(
         assert now_s == pytest.approx(true_s + wrong_s - 1000.0, abs=0.02)
     assert np.diff([true_s for _, true_s in came]).min() > 0.2
     assert clock.status() == {"clock_ticks_skipped": 4 * 3600, "clock_set_back": 1}
+
+
+@pytest.mark.parametrize("from_s", [1005.1, 1005.255])  # while the loop sleeps, and while it works
+def test_a_wall_clock_that_leaps_past_the_end_and_is_set_right_ends_nothing(
+    monkeypatch: pytest.MonkeyPatch, from_s: float
+) -> None:
+    wall = Wall(monkeypatch, 1000.0)
+    wall.errors = [(from_s, 1e8), (1010.0, 0.0)]
+    seen = [now_s for now_s, _ in wall.ticks(WallClock(start_utc_s=1000.0, end_s=60.0))]
+    assert seen[-1] == 60.0
+    assert np.diff(seen).min() == 0.25
+    assert np.diff(seen).max() < 6.0
+
+
+def test_a_wall_clock_that_stays_past_the_end_ends_the_mission(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    wall = Wall(monkeypatch, 1000.0)
+    wall.errors = [(1005.1, 1e8)]
+    seen = [now_s for now_s, _ in wall.ticks(WallClock(start_utc_s=1000.0, end_s=60.0))]
+    assert seen[-1] == 5.0
+    assert wall.true_s == pytest.approx(1005.0 + DOUBTED_S, abs=1.0)
 
 
 def test_a_wall_clock_waits_for_the_start_and_for_a_clock_that_is_slewed(

@@ -47,7 +47,7 @@ class RemoteNode:
         self.line: ControlLine | None = None
         self.log = BeliefLog()
         self.counters: Counter[str] = Counter()
-        self.now_s = 0.0
+        self.now_s = self._present_s = 0.0
         self.is_answered = True
         self.in_real_time = False
         self._advance, self._until_answered, self._is_air_free = (
@@ -84,6 +84,7 @@ class RemoteNode:
 
         One that comes back is served the time that it is then.
         """
+        self._present_s = now_s
         if not self.is_answered:
             self.counters["periods_missed"] += 1
             if self.line is None:
@@ -144,13 +145,21 @@ class RemoteNode:
         self._told = []
 
     def _read(self, announced: list[int]) -> None:
-        """Take the announced frames from the line; all else on it is noise, and counted."""
+        """Take the announced frames from the line; all else on it is noise, and counted.
+
+        A frame of a period that is over would leave after the second that it is stamped with, and
+        give a wrong range: it is dropped.
+        """
+        is_late = self._present_s > self.now_s
         while True:
             self._reader.receive_data(self.port.read())
             while (heard := self._reader.next_frame()) is not None:
                 crc = crc32c(heard.frame)
                 if crc in announced:
                     announced.remove(crc)
+                    if is_late:
+                        self.counters["frames_late"] += 1
+                        continue
                     self.counters["frames_overwritten"] += len(self._to_send) == QUEUED_FRAMES
                     self._to_send.append(heard.frame)
                 else:

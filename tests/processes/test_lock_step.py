@@ -300,6 +300,27 @@ def test_in_real_time_a_process_that_comes_back_is_told_the_time_that_it_is() ->
     port.close()
 
 
+def test_in_real_time_a_frame_of_a_period_that_is_over_is_not_transmitted() -> None:
+    port = PseudoPort(DEFAULT_BAUD)
+    node = RemoteNode(1, port, lambda _: None, lambda _: None, lambda: True)
+    ours, theirs = map(ControlLine, socket.socketpair())
+    node.join(ours)
+    modem, sent = StampedModem(open_modem(f"serial://{port.name}")), []
+    for now_s, answered_s in ((2.0, 2.0), (4.0, 4.25)):
+        node.begin(now_s)
+        modem.send(b"stamped with its second", now_s)
+        if answered_s > now_s:
+            node.begin(answered_s)
+        node.answer(Done(now_s=now_s, frames=modem.frames_written()))
+        sent.append(node.tick(answered_s))
+    assert sent == [b"stamped with its second", None]
+    assert node.status()["frames_late"] == 1
+    node.leave()
+    theirs.close()
+    modem.close()
+    port.close()
+
+
 @pytest.mark.skipif(shutil.which("socat") is None, reason="apt-get install socat")
 def test_frames_cross_a_pair_of_ports_made_by_socat(tmp_path: Path) -> None:
     names = [tmp_path / "a", tmp_path / "b"]

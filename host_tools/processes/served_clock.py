@@ -135,9 +135,13 @@ class StampedModem:
         return tuple(arrival.crc for arrival in waiting)
 
     def frames_written(self) -> tuple[int, ...]:
-        """Return the CRCs of the frames that the operating system took since the last call."""
-        sent = self._line.status().sent
-        count, self._told = sent - self._told, sent
+        """Return the CRCs of the frames that have left the line's queue since the last call.
+
+        Those that it dropped are among them: the channel counts them as lost on the line.
+        """
+        status = self._line.status()
+        gone = status.sent + status.dropped_out
+        count, self._told = gone - self._told, gone
         return tuple(self._written.popleft() for _ in range(min(count, len(self._written))))
 
 

@@ -79,6 +79,10 @@ class SerialPort:
             self._tap("out", data[:count], now_s)
         return count
 
+    def discard_output(self, now_s: float) -> None:
+        """Forget what the port has taken and not passed on."""
+        self._guarded(serial.Serial.reset_output_buffer, now_s)
+
     def close(self) -> None:
         """Give the port back for good."""
         self._let_go()
@@ -101,7 +105,7 @@ class SerialPort:
             return None
         try:
             return move(self._serial)
-        except (serial.SerialException, OSError, TypeError) as error:
+        except (serial.SerialException, OSError, TypeError, termios.error) as error:
             # pyserial raises TypeError when its descriptor vanished under it
             self.last_error = str(error)
             self._let_go()

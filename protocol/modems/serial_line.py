@@ -20,13 +20,16 @@ from protocol.modems.port import SerialPort
 
 DEFAULT_BAUD = 19_200
 SLOWEST_BAUD, FASTEST_BAUD = 300, 4_000_000
+LATE_S = 0.5
+"""A frame that the line has not taken so long after its second would give a wrong range."""
 
 
 class SerialLineModem:
-    """Moves frames over one port; while the port is away, frames wait in the bounded queue.
+    """Moves frames over one port; while it is away or full, frames wait in the bounded queue.
 
     A frame leaves the queue when its last byte was taken by the operating system; one that was cut
-    by a vanishing port is sent again from its start.
+    by a vanishing port is sent again from its start. One that is stamped with a second does not
+    wait for longer than LATE_S.
     """
 
     lead_s = 0.0
@@ -36,7 +39,7 @@ class SerialLineModem:
         self._port, self._was_open = SerialPort(path, baud, tap, rts=True), True
         self.bytes_read = 0
         self._reader = LineReader()
-        self._queue: deque[bytes] = deque()
+        self._queue: deque[tuple[bytes, float | None]] = deque()  # and the second of its stamp
         self._written = 0
         self._events: deque[ModemEvent] = deque()
         self._sent = self._received = self._dropped_out = self._dropped_in = 0
@@ -46,12 +49,12 @@ class SerialLineModem:
         """The longest frame that the line carries whole: the guard less COBS's overhead."""
         return GUARD_BYTES - 4
 
-    def send(self, frame: bytes, now_s: float, start_s: float | None = None) -> None:  # noqa: ARG002
+    def send(self, frame: bytes, now_s: float, start_s: float | None = None) -> None:
         """Queue a frame; when the queue is full the oldest one not yet begun is dropped."""
         if len(self._queue) == QUEUED_FRAMES:
             del self._queue[1 if self._written else 0]
             self._dropped_out += 1
-        self._queue.append(wrap(frame))
+        self._queue.append((wrap(frame), start_s))
         self._flush(now_s)
 
     def poll(self, now_s: float) -> None:
@@ -85,8 +88,9 @@ class SerialLineModem:
         self._was_open = False
 
     def _flush(self, now_s: float) -> None:
+        self._drop_late(now_s)
         while self._queue:
-            frame = self._queue[0]
+            frame, _ = self._queue[0]
             self._written += self._port.push(frame[self._written :], now_s)
             if self._written < len(frame):
                 break
@@ -94,6 +98,15 @@ class SerialLineModem:
             self._written = 0
             self._sent += 1
         self._note_loss(now_s)
+
+    def _drop_late(self, now_s: float) -> None:
+        """Drop frames whose second has passed, and what waits before them in the system."""
+        timely = [(f, s) for f, s in self._queue if s is None or abs(now_s - s) <= LATE_S]
+        late = len(self._queue) - len(timely)
+        if late:
+            self._dropped_out += late
+            self._queue, self._written = deque(timely), 0
+            self._port.discard_output(now_s)
 
     def _take(self, now_s: float) -> None:
         data = self._port.read(now_s)

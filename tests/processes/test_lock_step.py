@@ -21,6 +21,7 @@ from host_tools.processes.process_group import ProcessGroup
 from host_tools.processes.remote_node import MOST_TRIES, RemoteNode
 from host_tools.processes.served_clock import ServedClock, StampedModem
 from protocol.acoustics import Delivery, Water, WaterSettings
+from protocol.crc import crc32c
 from protocol.errors import ConfigError, ModemUnavailable
 from protocol.framing import wrap
 from protocol.modems.base import Reception
@@ -297,6 +298,20 @@ def test_in_real_time_a_process_that_comes_back_is_told_the_time_that_it_is() ->
     assert node.is_answered
     node.leave()
     theirs.close()
+    port.close()
+
+
+def test_a_frame_that_the_line_dropped_is_not_mistaken_for_the_next(tmp_path: Path) -> None:
+    port = PseudoPort(DEFAULT_BAUD, tmp_path / "modem")
+    modem = StampedModem(open_modem(f"serial://{port.name}"))
+    port.unplug()
+    modem.poll(0.0)
+    modem.send(b"late", 1.0, 1.0)
+    port.plug()
+    modem.poll(3.0)
+    modem.send(b"in time", 4.0, 4.0)
+    assert modem.frames_written() == (crc32c(b"late"), crc32c(b"in time"))
+    modem.close()
     port.close()
 
 

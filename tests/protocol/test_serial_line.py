@@ -12,7 +12,7 @@ import pytest
 
 from protocol.codec import decode, encode
 from protocol.errors import ConfigError, ModemUnavailable, RemoteProtocolError
-from protocol.framing import wrap
+from protocol.framing import LineReader, wrap
 from protocol.modems.base import QUEUED_FRAMES, LinkNotice, Reception
 from protocol.modems.port import REOPEN_S
 from protocol.modems.registry import DIALECTS, open_modem
@@ -252,6 +252,30 @@ def test_a_full_line_is_written_in_pieces_without_blocking(port: Port) -> None:
             break
         time.sleep(0.001)
     assert line == b"".join(map(wrap, sent))
+    modem.close()
+
+
+def test_a_frame_that_the_line_takes_too_late_for_its_second_is_dropped(port: Port) -> None:
+    modem, number = open_line(port), 0
+    while not modem.status().queued:  # the peer does not read
+        modem.send(number.to_bytes(2) + bytes(254), 1.0, 1.0)
+        number += 1
+    modem.send(b"some time", 1.0)
+    for now_s in (1.25, 60.0):
+        modem.poll(now_s)
+    assert modem.status().dropped_out == 1
+    modem.send(b"in time", 60.0, 60.0)
+    reader, came = LineReader(), [b""]
+    for _ in range(1000):
+        modem.poll(60.25)
+        reader.receive_data(port.read())
+        while (heard := reader.next_frame()) is not None:
+            came.append(heard.frame)
+        if came[-1] == b"in time":
+            break
+        time.sleep(0.001)
+    assert came[-2:] == [b"some time", b"in time"]
+    assert len(came) < number  # what the system held is gone as well
     modem.close()
 
 

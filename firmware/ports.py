@@ -89,8 +89,13 @@ class ModemPort:
                 self.notices.append(event.text)
                 LOG.warning("%.2f s: %s", event.at_s, event.text)
 
-    def speak(self, poll: Callable[[float], bytes | None], now_s: float) -> None:
+    def speak(
+        self, poll: Callable[[float], bytes | None], now_s: float, late_s: float = 0.0
+    ) -> None:
         """Send the core's frames of this instant, or of the second that a lead before it is now.
+
+        late_s is what the loop's work has taken since this instant: the modem is told the time that
+        it is, lest it load a packet for a second that has passed.
 
         A modem that loads its packets before they start is given them by the last period that is
         early enough: what the core then knows is newest.
@@ -98,20 +103,18 @@ class ModemPort:
         While the port is away the core is not asked: a frame that waits in a queue would leave
         with a time of transmission that is no longer true, and its range would be wrong.
         """
-        start_s = self._start_s(now_s)
+        start_s = now_s if self._modem.lead_s == 0.0 else self._start_s(now_s + late_s)
         if start_s is not None and self._modem.status().is_up:
             for _ in range(self._modem.frames_per_packet):
                 frame = poll(start_s)
                 if frame is None:
                     break
-                self._modem.send(frame, now_s, start_s)
-        self._modem.poll(now_s)
+                self._modem.send(frame, now_s + late_s, start_s)
+        self._modem.poll(now_s + late_s)
 
     def _start_s(self, now_s: float) -> float | None:
         """Return when a frame that is handed over now would start; None: a later one does too."""
         earliest_s = now_s + self._modem.lead_s
-        if self._modem.lead_s == 0.0:
-            return now_s
         start_s = float(math.ceil(earliest_s - _SAME_INSTANT_S))
         return start_s if start_s - earliest_s < self._period_s - _SAME_INSTANT_S else None
 

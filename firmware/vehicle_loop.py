@@ -33,9 +33,11 @@ class VehicleLoop(ABC):
             for name, share, work in self._tasks()
         ]
         self._executive = Executive(tasks, stopwatch)
+        self._stopwatch, self._began_s = stopwatch, 0.0
 
     def step(self, now_s: float) -> None:
         """Do what is due now; never raises."""
+        self._began_s = self._stopwatch()
         self._executive.step(now_s)
 
     def status(self) -> dict[str, int]:
@@ -61,4 +63,4 @@ class VehicleLoop(ABC):
         self._sensors.feed(self.core, now_s)
 
     def _speak(self, now_s: float) -> None:
-        self._link.speak(self.core.poll, now_s)
+        self._link.speak(self.core.poll, now_s, self._stopwatch() - self._began_s)

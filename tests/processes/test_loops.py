@@ -1,5 +1,6 @@
 import itertools
 from collections.abc import Iterator
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from firmware.follower.settings import FollowerSettings
 from firmware.leader.worker import ThreadWorker
 from firmware.ports import ModemPort, SensorPort, SensorStep
 from firmware.soundings import Odometry, Ping
+from firmware.vehicle_loop import VehicleLoop, Work
 from host_tools.mission import deployed
 from host_tools.nodes import FollowerNode
 from host_tools.processes import vehicle as vehicle_process
@@ -176,6 +178,25 @@ def test_a_core_is_not_asked_for_frames_while_its_port_is_away() -> None:
     up = ModemStatus(is_up=True)
     port.speak(asked.append, now_s=2.0)
     assert asked == [2.0]
+
+
+@pytest.mark.parametrize(("lead_s", "start_s"), [(0.0, 1.0), (2.3, 4.0)])
+def test_a_modem_is_told_how_late_the_loop_is(lead_s: float, start_s: float) -> None:
+    stopwatch = [7.0]
+    modem, asked = MagicMock(lead_s=lead_s, frames_per_packet=1), MagicMock()
+    asked.poll.return_value = b"frame"
+
+    class Slow(VehicleLoop):
+        def _tasks(self) -> tuple[Work, ...]:
+            return (("work", 1.0, self._work), ("speak", 1.0, self._speak))
+
+        def _work(self, now_s: float) -> None:
+            stopwatch[0] += 0.6 * now_s
+
+    Slow(asked, modem, iter(()), lambda: stopwatch[0]).step(1.0)
+    asked.poll.assert_called_once_with(start_s)
+    modem.send.assert_called_once_with(b"frame", pytest.approx(1.6), start_s)
+    modem.poll.assert_called_once_with(pytest.approx(1.6))
 
 
 def test_the_loop_says_what_the_simulators_node_says() -> None:

@@ -78,7 +78,7 @@ def test_points_are_read_from_text_and_toml_alike() -> None:
         ("0,nan", "from 1300 to 1700"),
         ("nan,1500", "must be finite"),
         ("0,1500,inf,1500", "must be finite"),
-        ("0;1500", "type float"),
+        ("0;1500", "give a number"),
     ],
 )
 def test_what_is_no_profile_is_refused_with_a_reason(points: str, message: str) -> None:

@@ -7,7 +7,13 @@ from firmware.geometry import Array
 from firmware.leader.composition import CompositionSettings
 from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.pose_graph import PoseGraph
-from firmware.leader.wander import DriftChange, changes_of, expected_walk, likely_walk
+from firmware.leader.wander import (
+    DriftChange,
+    changes_of,
+    expected_walk,
+    likely_walk,
+    reckoned_m2,
+)
 from firmware.submaps import Track
 from protocol.errors import EstimationError
 
@@ -41,6 +47,41 @@ def _changes(
 def test_walk_is_found_whatever_the_estimate_assumed(walk: float, assumed: float) -> None:
     changes = _changes(np.random.default_rng(5), walk, assumed, noise_mps=0.01, count=200)
     assert likely_walk(changes, BELIEVED, FACTOR) == pytest.approx(walk, rel=0.3)
+
+
+def test_walk_is_that_of_the_posterior_of_what_was_measured() -> None:
+    """Each change was measured along one axis; it is held against walks by the thousand."""
+    rng, expected_m2ps2, spread = np.random.default_rng(8), 0.006**2 * INTERVAL_S, np.log(FACTOR)
+    log_walks = np.log(BELIEVED) + np.linspace(-8.0, 8.0, 8001)
+    log_likely = -0.5 * ((log_walks - np.log(BELIEVED) + spread**2) / spread) ** 2
+    changes = []
+    for angle_rad in rng.uniform(0.0, np.pi, 6):
+        measured_mps, noise_mps = 0.3 * rng.standard_normal(), rng.uniform(0.05, 0.15)
+        gain = expected_m2ps2 / (expected_m2ps2 + noise_mps**2)
+        axis = np.array([np.cos(angle_rad), np.sin(angle_rad)])
+        changes.append(
+            DriftChange(
+                interval_s=INTERVAL_S,
+                expected=expected_m2ps2 * np.eye(2),
+                change_mps=gain * measured_mps * axis,
+                found=expected_m2ps2 * (np.eye(2) - gain * np.outer(axis, axis)),
+            )
+        )
+        variances = np.exp(2.0 * log_walks) * INTERVAL_S + noise_mps**2
+        log_likely -= 0.5 * (np.log(variances) + measured_mps**2 / variances)
+    walk = np.sqrt(np.average(np.exp(2.0 * log_walks), weights=np.exp(log_likely)))
+    assert abs(walk / BELIEVED - 1.0) > 0.2
+    assert likely_walk(changes, BELIEVED, FACTOR) == pytest.approx(walk, rel=0.02)
+
+
+def test_variance_of_dead_reckoning_is_what_many_short_steps_add_up_to() -> None:
+    noise, walk, step_s = 0.3, 0.02, 0.05
+    transition, covariance = np.array([[1.0, step_s], [0.0, 1.0]]), np.diag([5.0, 0.1]) ** 2
+    for _ in range(2400):
+        covariance = transition @ covariance @ transition.T
+        covariance += step_s * np.diag([noise, walk]) ** 2
+    found_m2 = reckoned_m2(120.0, noise, walk, start_m=5.0, drift_mps=0.1)
+    assert found_m2 == pytest.approx(covariance[0, 0], rel=2e-3)
 
 
 def test_without_evidence_the_belief_stays() -> None:

@@ -1,12 +1,19 @@
 """Absolute positions: used where they fit, refused where not, late ones waited for."""
 
 import dataclasses
+from collections import Counter
 
 import numpy as np
 import pytest
 
 from firmware.inputs import from_odometry, to_odometry
 from firmware.leader.core import LeaderCore
+from firmware.leader.fixes import Fixes, FixSettings
+from firmware.leader.fleet import Fleet, FleetSettings
+from firmware.leader.graph_settings import GraphSettings
+from firmware.leader.pose_graph import PoseGraph
+from firmware.leader.range_judge import RangeSettings
+from firmware.leader.range_windows import RangeWindows
 from firmware.soundings import Fix, Odometry
 from host_tools.mission import local_nodes, run, simulated_vehicles, water_between
 from host_tools.mission_settings import MissionSettings, changed
@@ -41,6 +48,90 @@ def tell(leader: LeaderCore, fix: Fix, at_s: float) -> None:
     leader.receive_odometry(sample(at_s, fix))
     sail(leader, line(0.0, 0.0), at_s + 1.75, sonar_on=False)
     leader.tick(at_s + 1.75)
+
+
+def northbound() -> tuple[Fleet, PoseGraph]:
+    """Return a leader's fleet and graph after ten minutes to the north at 2 m/s."""
+    graph = PoseGraph(GraphSettings())
+    fleet = Fleet(graph, RangeWindows(RangeSettings()), FleetSettings())
+    for second in range(601):
+        fleet.own.add(float(second), 2.0 * second, 0.0, 0.0)
+    graph.add_chain(0, 0.0, np.zeros(2), np.zeros(2))
+    fleet.extend(0)
+    return fleet, graph
+
+
+def told_off(off_sigmas: float) -> tuple[Counter[str], float, float]:
+    """Return what became of a fix so far off to the north, with a sigma of 20 m and a floor of 10.
+
+    And by which shares of innovation and variance it changed the estimate.
+    """
+    fleet, graph = northbound()
+    anchor = graph.anchor(0, 300.0, fleet.track(0))
+    known_m2 = graph.covariance([anchor])[0, 0]
+    off_m = off_sigmas * np.sqrt(known_m2 + 20.0**2 + 10.0**2)
+    fixes = Fixes(FixSettings(sigma_floor_m=10.0), followers=0)
+    fixes.hold(300.0, Fix(north_m=600.0 + off_m, east_m=0.0, sigma_m=20.0))
+    fixes.use(fleet, graph, 600.0)
+    share = (known_m2 + 20.0**2 + 10.0**2) / known_m2  # the inverse of a Kalman gain
+    moved = share * (graph.position(anchor)[0] - 600.0) / off_m
+    return fixes.counters, moved, share * (1.0 - graph.covariance([anchor])[0, 0] / known_m2)
+
+
+def test_fix_counts_by_its_sigma_and_a_floor() -> None:
+    _, moved, narrowed = told_off(1.0)
+    assert (moved, narrowed) == pytest.approx((1.0, 1.0), abs=0.03)
+
+
+@pytest.mark.parametrize("off_sigmas", [3.6, -3.6, 3.8, -3.8])
+def test_fix_is_gated_by_what_is_known_and_its_own_sigma(off_sigmas: float) -> None:
+    counters, *_ = told_off(off_sigmas)  # 13.8 is 3.71 squared
+    assert counters == {"fixes_used" if abs(off_sigmas) < 3.7 else "fixes_rejected": 1}
+
+
+@pytest.mark.parametrize(
+    ("later_s", "off_m", "sigma_m", "alike"),
+    [
+        (59.0, 0.0, 2.0, True),
+        (-59.0, 0.0, 2.0, True),
+        (61.0, 0.0, 2.0, False),
+        (-61.0, 0.0, 2.0, False),
+        (1.0, 0.0, 1.01, True),
+        (1.0, 0.0, 0.99, False),
+        (1.0, 16.9, 2.0, True),  # 3 (2 + 2) + 5 * 1
+        (1.0, 17.1, 2.0, False),
+        (-30.0, 161.0, 2.0, True),  # it may have sailed so far
+        (30.0, 163.0, 2.0, False),
+    ],
+)
+@pytest.mark.parametrize("first_is_used", [False, True])
+def test_fixes_are_alike_where_one_vehicle_may_be_at_both_within_a_minute(
+    later_s: float, off_m: float, sigma_m: float, *, alike: bool, first_is_used: bool
+) -> None:
+    fixes = Fixes(FixSettings(), followers=0)
+    fixes.hold(300.0, Fix(north_m=600.0, east_m=7.0, sigma_m=2.0))
+    if first_is_used:
+        fixes.use(*northbound(), 600.0)
+        assert fixes.counters["fixes_used"] == 1
+    fix = Fix(north_m=600.0 + 0.6 * off_m, east_m=7.0 + 0.8 * off_m, sigma_m=sigma_m)
+    fixes.hold(300.0 + later_s, fix)
+    assert fixes.counters["fixes_alike"] == alike
+
+
+def test_fixes_that_wait_too_long_find_no_room_or_no_node_are_counted() -> None:
+    fleet, graph = northbound()
+    fixes = Fixes(FixSettings(held=2), followers=1)
+    for time_s in (-300.0, 700.0, 800.0):  # before the first node, and twice yet to come
+        overwritten = fixes.counters["fixes_overwritten"]
+        fixes.hold(time_s, Fix(north_m=2.0 * time_s, east_m=0.0, sigma_m=2.0))
+    assert (overwritten, fixes.counters["fixes_overwritten"]) == (0, 1)
+    fixes.use(fleet, graph, 1600.0)
+    assert fixes.counters["fixes_too_late"] == 0
+    fixes.use(fleet, graph, 1601.0)
+    assert fixes.counters["fixes_too_late"] == 1
+    fixes.hold(-300.0, Fix(north_m=-600.0, east_m=0.0, sigma_m=2.0))
+    fixes.use(fleet, graph, 1601.0)
+    assert fixes.counters["fixes_unplaceable"] == 1
 
 
 def test_fix_moves_the_estimate_and_narrows_it() -> None:
@@ -94,8 +185,9 @@ def test_fix_of_a_vehicle_that_says_nothing_is_given_up() -> None:
     assert leader.status()["fixes_too_late"] == 1
 
 
-def test_fix_of_an_unknown_vehicle_is_counted_and_dropped() -> None:
-    leader = sailed(60, Fix(vehicle=2, north_m=0.0, east_m=0.0, sigma_m=1.0))
+@pytest.mark.parametrize("vehicle", [-1, 2])
+def test_fix_of_an_unknown_vehicle_is_counted_and_dropped(vehicle: int) -> None:
+    leader = sailed(60, Fix(vehicle=vehicle, north_m=0.0, east_m=0.0, sigma_m=1.0))
     assert leader.status()["fixes_of_unknown_vehicles"] == 1
 
 

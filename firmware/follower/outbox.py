@@ -27,7 +27,7 @@ class Outbox:
 
     def add(self, packets: Sequence[Fragment]) -> None:
         """Queue a sub-map, unless half of an earlier one still waits: it would only grow old."""
-        if 2 * self._queue.fresh >= max(len(packets), 2):
+        if 2 * self._queue.fresh >= len(packets):
             self.counters["submaps_without_air"] += 1
             return
         self._queue.add(packets)

@@ -137,3 +137,107 @@ def test_only_a_range_that_is_held_overwrites_another() -> None:
     assert ranging.counters["ranges_overwritten"] == 0
     ranging.hold(1, header, 136.4, DEPTH_M)
     assert ranging.counters["ranges_overwritten"] == 1
+
+
+class Sighted:
+    """A graph that knows of two vehicles 400 m apart, and what ranges it is told.
+
+    The clock of the second is 30 m ahead, give or take 5. The way between them is known to a metre
+    along, and across as a bend of the range says.
+    """
+
+    AWAY_M = np.array([240.0, 320.0])
+    SIGMA_M = float(np.hypot(1.0, 5.0))
+
+    def __init__(self, settings: RangeSettings) -> None:
+        self.graph, self.ranging = MagicMock(), RangeWindows(settings)
+        self.told: list[tuple[float, float, float]] = []  # sent at, range and spread
+        self.graph.anchor = lambda vehicle, time_s, _: MagicMock(vehicle=vehicle, time_s=time_s)
+        self.graph.position = lambda anchor: self.AWAY_M * anchor.vehicle
+        self.graph.clock.return_value = 30.0, 5.0
+        self.graph.__contains__.return_value = True
+        self.graph.add_range = self._add_range
+        self.judge = MagicMock(wraps=self.ranging._judge)
+        self.ranging._judge = self.judge
+
+    def _add_range(
+        self, here: MagicMock, there: MagicMock, range_m: float, spread_m: float, *, sender: int
+    ) -> int:
+        assert (here.vehicle, there.vehicle, sender) == (0, 1, 1)
+        self.told.append((there.time_s, range_m, spread_m))
+        return len(self.told) - 1
+
+    def use(self, begin_s: float, bent_m: float, ranges_m: list[float]) -> None:
+        """Hear ranges every four seconds and use them, while they bend so much."""
+        along = self.AWAY_M / np.hypot(*self.AWAY_M)
+        turn = np.column_stack([along, [-along[1], along[0]]])
+        covariance_m2 = turn @ np.diag([1.0, np.sqrt(2.0) * 400.0 * bent_m]) @ turn.T
+        self.graph.covariance.return_value = np.kron(np.diag([0.0, 1.0]), covariance_m2)
+        for k, range_m in enumerate(ranges_m):
+            sent_s = begin_s + 4.0 * k
+            header = replace(paper_packet().header, tx_second=int(sent_s % 16))
+            self.ranging.hold(1, header, sent_s + range_m / 1500.0, DEPTH_M)
+        self.ranging.use(1, _track(begin_s + 60.0), 0, _track(begin_s + 60.0), self.graph)
+
+
+@pytest.mark.parametrize(("depth_m", "across_m"), [(10.0, 400.0), (310.0, 500.0)])
+def test_a_range_loses_its_stretch_and_its_slant_but_not_what_the_clock_adds(
+    depth_m: float, across_m: float
+) -> None:
+    sighted = Sighted(RangeSettings(follower_depth_m=depth_m))
+    sighted.AWAY_M = sighted.AWAY_M * across_m / 400.0
+    slant_m = float(np.hypot(across_m, depth_m - DEPTH_M))
+    true_m, stretched_m = 30.0 + slant_m, 30.0 + 1.1 * slant_m
+    sighted.use(16.0, 0.1, [true_m, true_m, stretched_m, true_m, true_m + 300.0, true_m])
+    times_s, ranges_m, spreads_m = np.transpose(sighted.told)
+    assert times_s == pytest.approx([16.0, 20.0, 24.0, 28.0, 36.0])
+    assert ranges_m == pytest.approx(np.full(5, 30.0 + across_m))
+    bent_m, steepness = 0.1 * 400.0 / across_m, (depth_m - DEPTH_M) / across_m
+    spread_m = np.hypot(bent_m, RangeSettings().sigma_m * steepness)
+    assert spreads_m == pytest.approx(np.full(5, spread_m), rel=1e-3)
+    fates = [sighted.ranging.counters[f"ranges_{f}"] for f in ("used", "unstretched", "rejected")]
+    assert fates == [4, 1, 1]
+    *_, sigma_m = sighted.judge.judge.call_args.args
+    assert sigma_m == pytest.approx(np.hypot(Sighted.SIGMA_M, bent_m))
+
+
+def test_a_window_is_entered_the_less_roughly_the_less_it_bends() -> None:
+    """Anew once it bends half as much, and newest first; it teaches the judge once."""
+    sighted, ranges_m = Sighted(RangeSettings()), [430.0] * 5
+    rough = RangeSettings().bent_alike * np.sqrt(5.0)
+    for begin_s, bent_m, told in (
+        (16.0, 1.59, [(16.0, 1.59 * rough)]),
+        (216.0, 0.7, [(216.0, 0.7 * rough), (16.0, 0.7 * rough)]),
+        (416.0, 0.6, [(416.0, 0.6 * rough)]),  # 0.7 has to become less than 0.35
+        (616.0, 0.45, [(616.0, 0.45), (416.0, 0.45), (216.0, 0.45), (16.0, 0.45)]),
+    ):
+        sighted.told.clear()
+        sighted.graph.set_active.reset_mock()
+        sighted.use(begin_s, bent_m, ranges_m)
+        assert [time_s for time_s, *_ in sighted.told[::5]] == [time_s for time_s, _ in told]
+        spreads_m = np.repeat([spread_m for _, spread_m in told], 5)
+        assert [spread_m for *_, spread_m in sighted.told] == pytest.approx(spreads_m, rel=1e-3)
+        assert sighted.graph.set_active.call_count == 5 * (len(told) - 1)
+    assert not sighted.ranging._waiting[1]
+    assert sighted.judge.learn.call_count == 4
+    counters = sighted.ranging.counters
+    assert (counters["ranges_used_roughly"], counters["ranges_used"]) == (15, 20)
+
+
+@pytest.mark.parametrize(("bent_m", "waits"), [(7.9, False), (8.1, True)])
+def test_a_window_that_bends_by_more_than_a_fiftieth_waits(bent_m: float, *, waits: bool) -> None:
+    sighted = Sighted(RangeSettings())
+    sighted.use(16.0, bent_m, [430.0] * 5)
+    assert len(sighted.told) == (0 if waits else 5)
+    assert len(sighted.ranging._waiting[1]) == 1
+
+
+def test_a_rough_window_that_was_composed_with_others_stays_as_it_is() -> None:
+    sighted = Sighted(RangeSettings())
+    sighted.use(16.0, 1.5, [430.0] * 5)
+    sighted.graph.__contains__.return_value = False
+    sighted.use(216.0, 0.1, [430.0] * 5)
+    assert [time_s for time_s, *_ in sighted.told[5:]] == [216.0, 220.0, 224.0, 228.0, 232.0]
+    assert sighted.graph.set_active.call_count == 0
+    assert sighted.ranging.counters["ranges_left_rough"] == 5
+    assert not sighted.ranging._waiting[1]

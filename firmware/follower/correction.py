@@ -291,6 +291,6 @@ class DriftCorrection:
             return False
         self.restarted += 1
         self._base, self._seen = self._deployment, []
-        self._filter_on([lost for lost in self._lost if lost.time_s > self._deployment.time_s])
+        self._filter_on(self._lost)
         self._take(answer)
         return True

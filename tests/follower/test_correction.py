@@ -5,6 +5,7 @@ import pickle
 import numpy as np
 import pytest
 
+from firmware.dead_reckoning import LOST_SIGMA_MPS
 from firmware.follower.correction import CorrectionSettings, DriftCorrection
 from firmware.follower.drift_filter import (
     AnswerSeen,
@@ -186,6 +187,34 @@ def test_leader_that_changes_its_mind_twice_alike_is_believed() -> None:
     assert position_m == pytest.approx([0.0, 0.0], abs=4.0)
 
 
+@pytest.mark.parametrize(
+    ("apart_s", "apart_m", "believed"),
+    [(40.0, 25.0, True), (40.0, 27.0, False), (2.0, 7.0, True), (2.0, 11.0, False)],
+)
+def test_only_answers_that_agree_make_a_follower_start_over(
+    apart_s: float, apart_m: float, *, believed: bool
+) -> None:
+    """Within four sigmas of 2 m, and three of a drift of 0.15 m/s meanwhile."""
+    correction, moved_m = taught(), np.array([300.0, 0.0])
+    correction.lose(100.0, 101.0)
+    assert not correction.receive_answer(640.0, drift_m(640.0), moved_m, 2.0)
+    later_s = 640.0 + apart_s
+    moved_m = np.array([300.0, apart_m])
+    ran_away_m = drift_m(640.0)
+    assert correction.receive_answer(later_s, ran_away_m, moved_m, 2.0) is believed
+    assert correction.restarted == believed
+    position_m, _ = correction.corrected(later_s, ran_away_m)
+    assert position_m == pytest.approx(moved_m if believed else np.zeros(2), abs=8.0)
+
+
+def test_a_right_answer_between_takes_a_wrong_one_its_witness() -> None:
+    correction = taught()
+    for time_s, off_m in ((640.0, 300.0), (680.0, 0.0), (720.0, 300.0)):
+        believed = correction.receive_answer(time_s, drift_m(time_s), np.array([off_m, 0.0]), 2.0)
+        assert believed is (off_m == 0.0)
+    assert (correction.restarted, correction.gated) == (0, 2)
+
+
 def test_repeated_answer_is_not_counted_as_new_evidence() -> None:
     once, often = taught(), taught()
     for correction, times in ((once, 1), (often, 20)):
@@ -194,6 +223,63 @@ def test_repeated_answer_is_not_counted_as_new_evidence() -> None:
     for part in (0, 1):
         known = once.corrected(700.0, np.zeros(2))[part]
         assert often.corrected(700.0, np.zeros(2))[part] == pytest.approx(known)
+
+
+def assert_alike(one: DriftCorrection, other: DriftCorrection, time_s: float) -> None:
+    for part, as_well in zip(
+        one.corrected(time_s, np.zeros(2)), other.corrected(time_s, np.zeros(2)), strict=True
+    ):
+        assert part == pytest.approx(as_well)
+
+
+def test_a_later_answer_for_the_same_state_takes_the_place_of_the_earlier_one() -> None:
+    replaced, told_once = (DriftCorrection(0.0, CorrectionSettings()) for _ in range(2))
+    for correction, offs_m in ((replaced, ([6.0, -4.0], [0.0, 0.0])), (told_once, ([0.0, 0.0],))):
+        for time_s in (200.0, 300.0, 500.0):
+            correction.receive_answer(time_s, drift_m(time_s), np.zeros(2), 12.0 - time_s / 50.0)
+        for off_m in offs_m:
+            assert correction.receive_answer(400.0, drift_m(400.0), np.array(off_m), 1.0)
+    assert_alike(replaced, told_once, 600.0)
+
+
+def test_an_answer_long_under_way_is_held_against_what_was_believed_of_its_time() -> None:
+    correction = DriftCorrection(0.0, CorrectionSettings())
+    assert correction.receive_answer(600.0, np.array([90.0, 0.0]), np.zeros(2), 1.0)
+    assert correction.receive_answer(20.0, np.array([0.5, 0.0]), np.zeros(2), 1.0)
+    position_m, _ = correction.corrected(600.0, np.array([90.0, 0.0]))
+    assert position_m == pytest.approx([0.0, 0.0], abs=2.0)
+
+
+def test_what_comes_in_any_order_teaches_the_same() -> None:
+    """Ranges, an answer and a loss; no part counts twice."""
+    forward, shuffled = (DriftCorrection(0.0, CorrectionSettings()) for _ in range(2))
+    for correction, order in ((forward, (0, 1, 2, 3, 4)), (shuffled, (3, 0, 4, 2, 1))):
+        for k in order:
+            time_s = 100.0 + 20.0 * k
+            if k == 1:
+                assert correction.receive_answer(time_s, drift_m(time_s), np.ones(2), 4.0)
+            elif k == 2:
+                correction.lose(time_s - 3.0, time_s)
+            else:
+                range_m = 300.0 + k
+                leader_m = drift_m(time_s) + np.array([0.0, 300.0])
+                assert correction.receive_range(
+                    time_s, drift_m(time_s), leader_m, 1.0, range_m, 0.0
+                )
+    assert (forward.ranges_accepted, forward.accepted) == (3, 1)
+    assert_alike(forward, shuffled, 200.0)
+
+
+@pytest.mark.parametrize(
+    ("time_s", "missed_m", "echo"),
+    [(300.0, 45.0, True), (300.0, 57.0, False), (3000.0, 45.0, False)],
+)
+def test_an_answer_near_dead_reckoning_is_an_echo_of_it_as_long_as_that_is_likelier(
+    time_s: float, missed_m: float, *, echo: bool
+) -> None:
+    correction = DriftCorrection(0.0, CorrectionSettings())
+    assert correction.receive_answer(time_s, np.array([missed_m, 0.0]), np.zeros(2))
+    assert (alone_sigma_m(correction, time_s) > 15.0) is echo
 
 
 def test_answer_older_than_all_that_is_kept_changes_nothing() -> None:
@@ -298,6 +384,7 @@ def test_range_shorter_than_depths_are_apart_is_dropped() -> None:
 def test_answer_that_is_no_position_is_dropped(bad: float) -> None:
     correction = taught()
     assert not correction.receive_answer(640.0, np.zeros(2), np.array([bad, 0.0]))
+    assert correction.gated == 1
     assert np.isfinite(correction.corrected(700.0, np.zeros(2))[0]).all()
 
 
@@ -314,6 +401,40 @@ def test_a_range_heard_while_navigation_is_lost_is_held_against_the_doubt_so_far
     mean, covariance = state.blended()
     assert np.abs(mean[2:4] - BIAS_MPS).max() < 3.0 * np.sqrt(covariance[2, 2])
     assert covariance[0, 0] > 250.0**2 * 0.5
+
+
+def test_a_loss_told_in_parts_is_one_loss() -> None:
+    whole, parts = taught(), taught()
+    whole.lose(610.0, 630.0)
+    for time_s in np.arange(610.0, 630.0, 0.25):
+        parts.lose(float(time_s), float(time_s) + 0.25)
+    assert len(parts._seen) == len(whole._seen)
+    assert_alike(whole, parts, 640.0)
+    before_m2, lost_m2 = (c.corrected(640.0, np.zeros(2))[1][0, 0] for c in (taught(), whole))
+    assert lost_m2 - before_m2 == pytest.approx((20.0 * LOST_SIGMA_MPS) ** 2)
+
+
+@pytest.mark.parametrize("losses", [1, 300])
+def test_what_was_lost_makes_less_sure_answers_news(losses: int) -> None:
+    correction = DriftCorrection(0.0, CorrectionSettings())
+    before_m2 = correction.corrected(2000.0, np.zeros(2))[1][0, 0]
+    for k in range(losses):
+        correction.lose(500.0 + 5.0 * k, 502.0 + 5.0 * k)
+    alone_m2 = correction.corrected(2000.0, np.zeros(2))[1][0, 0]
+    assert alone_m2 - before_m2 == pytest.approx(losses * (2.0 * LOST_SIGMA_MPS) ** 2)
+    for share, told in ((0.97, False), (0.93, True)):
+        sigma_m = float(np.sqrt(share * alone_m2))
+        assert correction.receive_answer(2000.0, np.zeros(2), np.zeros(2), sigma_m) is told
+    assert correction.empty == 1
+    assert len(correction._lost) <= 96
+
+
+def test_what_is_lost_later_makes_no_answer_news() -> None:
+    correction = DriftCorrection(0.0, CorrectionSettings())
+    sigma_m = 0.98 * alone_sigma_m(correction, 400.0)
+    correction.lose(500.0, 520.0)
+    assert not correction.receive_answer(400.0, np.zeros(2), np.zeros(2), sigma_m)
+    assert correction.empty == 1
 
 
 def test_what_was_learned_by_a_clock_that_was_ahead_stays_when_it_is_set_right() -> None:
@@ -333,7 +454,12 @@ def test_a_clock_set_back_by_less_than_answers_are_old_leaves_them_their_times()
     correction = taught(600.0)
     leader_m = np.array([500.0, 0.0])
     assert correction.receive_range(699.9, drift_m(699.9), leader_m, 1.0, 500.0, 0.0)
+    correction.lose(699.9, 700.0)
+    believed_m, covariance_m2 = correction.corrected(700.0, np.zeros(2))
     correction.set_back(700.0, 699.75)
+    left_m, left_m2 = correction.corrected(699.75, np.zeros(2))
+    assert left_m == pytest.approx(believed_m, abs=0.1)
+    assert left_m2 == pytest.approx(covariance_m2, abs=0.3)
     assert correction.receive_answer(640.0, drift_m(640.0), np.zeros(2))
     assert correction.stale == 0
 

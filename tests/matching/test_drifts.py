@@ -39,20 +39,24 @@ def _misfit(surface: ErrorSurface, shift_m: Array) -> float:
     return float(surface.residual_m2[row, column] / surface.noise_m2[row, column])
 
 
-def test_true_shift_fits_once_the_drift_that_it_implies_is_taken_out() -> None:
-    scene = Scene(3)
+@pytest.mark.parametrize("expected_m", [(0.0, 0.0), (24.0, -16.0)])
+def test_true_shift_fits_once_the_drift_that_it_implies_is_taken_out(
+    expected_m: tuple[float, float],
+) -> None:
+    scene, prior = Scene(3), Prior(np.array(expected_m), PRIOR.covariance_m2)
+    true_m = TRUE_M + prior.mean_m
     reference, query = (_strained(scene, southward=south) for south in (False, True))
     query = dataclasses.replace(
-        query, north0_m=query.north0_m - TRUE_M[0], east0_m=query.east0_m - TRUE_M[1]
+        query, north0_m=query.north0_m - true_m[0], east0_m=query.east0_m - true_m[1]
     )
     settings = MatchingSettings(position_sigma_m=0.1)
     problem = pair_problem(reference, query, settings)
     assert problem is not None
     plain = problem.surface()
-    by_drift = screened_by_drift(problem, plain, (reference, query), LINEAR, PRIOR)
+    by_drift = screened_by_drift(problem, plain, (reference, query), LINEAR, prior)
     assert by_drift.residual_m2.shape == plain.residual_m2.shape
-    assert _misfit(plain, TRUE_M) > 3.0 * _misfit(by_drift, TRUE_M)
-    assert _misfit(by_drift, np.zeros(2)) == _misfit(plain, np.zeros(2))
+    assert _misfit(plain, true_m) > 3.0 * _misfit(by_drift, true_m)
+    assert _misfit(by_drift, prior.mean_m) == _misfit(plain, prior.mean_m)
 
 
 def test_known_drift_needs_no_second_look() -> None:
@@ -90,6 +94,26 @@ def test_drifts_of_both_sides_are_told_apart() -> None:
     assert drifts.covariance(offset_m2)[:2, :2] == pytest.approx(1e-6 * np.eye(2))
     assert 0.7 < drifts.unresolved_m(offset_m2) < 1.8
     assert drifts.unresolved_m(100.0 * offset_m2) > 4.0  # more drifts than are tried
+
+
+@pytest.mark.parametrize("share", [0.01, 1.0, 100.0])
+def test_what_stays_unresolved_is_what_shifts_have_beside_the_drift_nearest_to_them(
+    share: float,
+) -> None:
+    """Cells of an age of 40 s / sqrt(12), and to the nearest of two metres once they are warped."""
+    gain = np.array([[0.0, 0.0], [0.0, 0.0], [-0.004, 0.0], [0.0, -0.006]])
+    drifts, offset_m2 = Drifts(gain=gain, left=np.zeros((4, 4))), share * np.diag([400.0, 900.0])
+    apart_m, tried = [], []
+    for axis, steps_m in enumerate(drifts.steps_m(offset_m2)):
+        shifts_m = np.linspace(-2.5, 2.5, 5001) * np.sqrt(offset_m2[axis, axis])
+        away_m = np.abs(shifts_m[:, None] - steps_m[:, axis]).min(axis=1)
+        drifts_mps = away_m * np.abs(gain[2 + axis, axis])
+        apart_m.append(40.0 / np.sqrt(12.0) * np.sqrt(np.mean(drifts_mps**2)))
+        tried.append(len(steps_m))
+    rounded_m = 0.8 if max(tried) > 1 else 0.0
+    unresolved_m = np.hypot(max(apart_m), rounded_m)
+    assert drifts.unresolved_m(offset_m2) == pytest.approx(unresolved_m, rel=0.01)
+    assert tried == {0.01: [1, 1], 1.0: [3, 5], 100.0: [7, 7]}[share]
 
 
 def test_query_is_warped_by_its_own_drift() -> None:

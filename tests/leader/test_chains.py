@@ -46,6 +46,16 @@ def test_odometry_is_as_unsure_as_noise_walk_and_what_was_lost() -> None:
     assert record.bias_sigma_mps**2 == pytest.approx(0.01**2 * 20.0)
 
 
+def test_a_loss_that_goes_on_is_one_span_and_grows_with_its_time() -> None:
+    one = chain(0, [0.0])
+    for begin_s, end_s in ((40.0, 41.0), (10.0, 12.0), (12.0, 14.0), (9.0, 15.0), (16.0, 17.0)):
+        one.lose(begin_s, end_s)
+    assert sorted(one.lost) == [(9.0, 15.0), (16.0, 17.0), (40.0, 41.0)]
+    assert one.lost_m2(0.0, 11.0) == pytest.approx((2.0 * LOST_SIGMA_MPS) ** 2)
+    grown_m2 = (36.0 - 4.0 + 1.0 + 0.25) * LOST_SIGMA_MPS**2
+    assert one.lost_m2(11.0, 40.5) == pytest.approx(grown_m2)
+
+
 def test_of_too_many_lost_spans_the_nearest_become_one() -> None:
     one = chain(0, [0.0])
     begins_s = list(itertools.accumulate([0.0, *(10.0 + k % 7 for k in range(1023))]))

@@ -134,11 +134,19 @@ def test_one_axis_closure_knows_how_its_contour_bends(
     assert strays or found_m2 < 0.5
 
 
-def test_one_axis_closure_has_the_axis_of_the_whole_ridge_not_of_what_the_prior_leaves() -> None:
-    """A few degrees beside it, it would be metres off where the prior is wrong by three sigmas."""
+@pytest.mark.parametrize("prior", [(0.0, 10.0), (600.0, 20.0)])
+def test_one_axis_closure_has_the_axis_of_the_whole_ridge_not_of_what_the_prior_leaves(
+    prior: tuple[float, float],
+) -> None:
+    """A few degrees beside it, it would be metres off where the prior is wrong by three sigmas.
+
+    Nor does it matter how far across the ridge the prior lies.
+    """
+    away_m, sigma_m = prior
     right, about = (np.array([np.cos(at), np.sin(at)]) for at in (1.07, 1.17))
     off_m = right[0] * CROSS_M[:, None] + right[1] * CROSS_M[None, :]
     surface = _ridge(off_m)
-    found = ridge_of(surface, 1.0, Prior(np.zeros(2), 100.0 * np.eye(2)), np.zeros(2), about)
+    believed = Prior(away_m * right, sigma_m**2 * np.eye(2))
+    found = ridge_of(surface, 1.0, believed, np.zeros(2), about)
     assert np.degrees(np.arccos(found.axis @ right)) < 1.0
     assert np.degrees(found.sigma_rad) < 3.0

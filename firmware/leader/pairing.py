@@ -134,7 +134,10 @@ class Calibrations:
         return float(np.hypot(s.wander_m * np.sqrt(share), _OFFSET_FLOOR_M))
 
     def _remaining(self, origin: Side, target: Side, shift_m: Array) -> tuple[float, float]:
-        """Return sigmas of tilt and bend of the pair's difference half way between the tracks."""
+        """Return sigmas of tilt and bend of the pair's difference half way between the tracks.
+
+        A vehicle errs alike on both of its lines, two vehicles err each on their own.
+        """
         half_m = 0.5 * (target.track_m + shift_m - origin.track_m)
         slopes = []
         for side, sign in ((origin, 1.0), (target, -1.0)):
@@ -145,9 +148,10 @@ class Calibrations:
         if origin.sheet.id.vehicle == target.sheet.id.vehicle:
             slopes, covariances = [slopes[0] + slopes[1]], covariances[:1]
         tilt = sum(g @ p @ g.T for g, p in zip(slopes, covariances, strict=True))
-        crossing = 1.0 - float(origin.starboard @ target.starboard) ** 2
+        alike = float(origin.starboard @ target.starboard) ** 2
+        unlike = 1.0 - alike if len(covariances) == 1 else 1.0 + alike
         width_m = min(origin.swath.half_width_m, target.swath.half_width_m)
-        bend_m2 = crossing * max(p[1, 1] for p in covariances) / width_m**2
+        bend_m2 = unlike * max(p[1, 1] for p in covariances) / width_m**2
         return (
             float(np.sqrt(np.linalg.eigvalsh(tilt)[-1] + _TILT_FLOOR**2)),
             float(np.sqrt(bend_m2 + _BEND_FLOOR_PER_M**2)),

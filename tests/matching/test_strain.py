@@ -63,6 +63,16 @@ def test_one_unknown_drift_strains_lines_of_opposite_heading_most(
     assert apart_m == pytest.approx(DRIFT_MPS * apart_s, abs=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("heading_rad", "starboard"),
+    [(0.0, [0.0, 1.0]), (np.pi / 2, [-1.0, 0.0]), (-np.pi / 2, [1.0, 0.0])],
+)
+def test_starboard_is_to_the_right_of_the_heading(
+    heading_rad: float, starboard: list[float]
+) -> None:
+    assert _side(heading_rad).starboard == pytest.approx(starboard)
+
+
 def _hints(scenes: list[Scene], prior_m: float, strain_m: float = 0.0) -> int:
     """Return how many scenes leave a hint of the shift between two sub-maps."""
     sigmas, prior_m2 = PairSigmas(strain_m=strain_m), prior_m**2 * np.eye(2)

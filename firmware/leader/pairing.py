@@ -129,7 +129,7 @@ class Calibrations:
         s = self._settings
         share = 1.0
         if origin.sheet.id.vehicle == target.sheet.id.vehicle:
-            apart_s = abs(target.sheet.time_s - origin.sheet.time_s)
+            apart_s = target.sheet.time_s - origin.sheet.time_s
             share = 1.0 - float(np.exp(-0.5 * (apart_s / s.wander_time_s) ** 2))
         return float(np.hypot(s.wander_m * np.sqrt(share), _OFFSET_FLOOR_M))
 

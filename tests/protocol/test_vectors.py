@@ -33,6 +33,7 @@ def ids(vector: dict[str, Any]) -> str:
 
 def test_files_are_what_the_command_writes(tmp_path: Path) -> None:
     vectors.main([str(tmp_path)])
+    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in FOLDER.iterdir()}
     for path in sorted(tmp_path.iterdir()):
         assert path.read_text() == (FOLDER / path.name).read_text(), (
             "the wire changed: raise VERSION, note it in CHANGELOG.md under Wire format, and run"

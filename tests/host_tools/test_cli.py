@@ -60,6 +60,7 @@ class Interrupts:
         if name == "host_tools.simulate":
             os.kill(os.getpid(), signal.SIGINT)
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # what runs in the background ignores it
 sys.meta_path.insert(0, Interrupts())
 sys.exit(main(["config", "show"]))
 """

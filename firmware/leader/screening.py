@@ -138,13 +138,13 @@ def error_surface(
     """
     datum_m = float(np.nanmean(reference.grid.depth_m))
     stack_r = _moments(reference, datum_m)
-    stack_q = _moments(query, datum_m)
+    stack_q = _moments(query, datum_m)[:, ::-1, ::-1]  # a correlation is a convolution with that
     rows, cols = reference.known.shape
     query_rows, query_cols = query.known.shape
     full = (rows + query_rows - 1, cols + query_cols - 1)
     size = tuple(fft.next_fast_len(n, real=True) for n in full)
     f_r = fft.rfft2(stack_r, s=size)
-    f_q = np.conj(fft.rfft2(stack_q, s=size))
+    f_q = fft.rfft2(stack_q, s=size)
     spectra = np.stack(
         [
             f_r[0] * f_q[0],
@@ -154,8 +154,8 @@ def error_surface(
             f_r[4] * f_q[0] + f_r[0] * f_q[4],
         ]
     )
-    sums = np.roll(fft.irfft2(spectra, s=size), (query_rows - 1, query_cols - 1), axis=(1, 2))
-    count, weight, first, second, noise = sums[:, : full[0], : full[1]]
+    sums = fft.irfft2(spectra, s=size)[:, : full[0], : full[1]]
+    count, weight, first, second, noise = sums
     count = np.round(count)
     weight = np.maximum(weight, 0.0)
     offset = first / (np.maximum(weight, 1e-9) + offset_ridge_cells)

@@ -8,6 +8,7 @@ design carries nuisances with Gaussian priors: depth offset, tilt and bend betwe
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from firmware.geometry import Array
@@ -37,7 +38,7 @@ class NoiseModel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Span:
-    """When one side of the overlap was measured; age_s (R, C) counts from the mean time."""
+    """When one side of the overlap was measured; age_s (N,) counts from the mean time."""
 
     mean_s: float
     length_s: float
@@ -46,24 +47,32 @@ class Span:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Aligned:
-    """Fields of the overlap at one shift, (R, C) on the query's lattice, zero outside."""
+    """Fields of the overlap at one shift, (N,) by its cells, of the query's lattice.
+
+    both (R, C) are these cells in the rectangle `at.query` of the query.
+    """
 
     shift_m: Array  # (2,) added to the query's coordinates
     cell_m: float
     centre_m: Array  # (2,) of the overlap, in the reference's coordinates
-    both: Array
+    at: Landing
+    both: NDArray[np.bool_]
     difference_m: Array
-    weight: Array
     variance_m2: Array
-    slope_r: Array  # (2, R, C)
-    slope_q: Array  # (2, R, C)
+    slope_r: Array  # (2, N)
+    slope_q: Array  # (2, N)
     spans: tuple[Span, Span]  # of reference and query
-    basis: Array  # (6, R, C) offset, tilt, bend
+    basis: Array  # (6, N) offset, tilt, bend
+
+    @property
+    def cells(self) -> int:
+        """How many cells overlap."""
+        return self.difference_m.size
 
     @property
     def extent_m(self) -> float:
         """How far the overlap's cells lie from its middle, root mean square."""
-        return float(np.sqrt(np.sum(self.basis[1:3] ** 2) / self.both.sum()))
+        return float(np.sqrt(np.sum(self.basis[1:3] ** 2) / self.cells))
 
 
 def fields_of(layer: Layer, smoothing_cells: float) -> Array:
@@ -95,63 +104,46 @@ def align(
     if at is None:
         return None
     under, over = sample(fields[0], at), fields[1][:, *at.query]
-    both = np.isfinite(under[0]) & np.isfinite(over[0])
-    if both.sum() < _LEAST_CELLS:
+    both = np.isfinite(under[_DEPTH]) & np.isfinite(over[_DEPTH])
+    found = np.flatnonzero(both)
+    if found.size < _LEAST_CELLS:
         return None
-    under, over = np.where(both, under, 0.0), np.where(both, over, 0.0)
+    under, over = (side.reshape(len(side), -1).take(found, axis=1) for side in (under, over))
+    row, column = np.divmod(found, both.shape[1])
     slope_r, slope_q = under[_SLOPES], over[_SLOPES]
     variance = under[_VARIANCE] + over[_VARIANCE] + noise.cell_sigma_m**2
     variance += 0.25 * noise.position_sigma_m**2 * np.sum((slope_r + slope_q) ** 2, axis=0)
-    clean = both.astype(np.float64)
+    cell_m, middle = query.grid.cell_m, np.array([row.mean(), column.mean()])
+    first_m = np.array([query.grid.north0_m, query.grid.east0_m])
+    corner = np.array([at.query[0].start, at.query[1].start])
     return Aligned(
         shift_m=shift_m,
-        cell_m=query.grid.cell_m,
-        centre_m=_centre(clean, query, at) + shift_m,
-        both=clean,
+        cell_m=cell_m,
+        centre_m=first_m + cell_m * (corner + middle) + shift_m,
+        at=at,
+        both=both,
         difference_m=under[_DEPTH] - over[_DEPTH],
-        weight=clean / variance,
         variance_m2=variance,
         slope_r=slope_r,
         slope_q=slope_q,
-        basis=_polynomials(clean, query.grid.cell_m),
-        spans=(_span(under[_TIME], clean), _span(over[_TIME], clean)),
+        basis=_polynomials(cell_m * (row - middle[0]), cell_m * (column - middle[1])),
+        spans=(_span(under[_TIME]), _span(over[_TIME])),
     )
 
 
-def _centre(both: Array, query: Layer, at: Landing) -> Array:
-    """Return the middle (2,) of the overlap in the query's coordinates."""
-    cells = both.sum()
-    row = at.query[0].start + both.sum(axis=1) @ np.arange(both.shape[0]) / cells
-    column = at.query[1].start + both.sum(axis=0) @ np.arange(both.shape[1]) / cells
-    origin_m = np.array([query.grid.north0_m, query.grid.east0_m])
-    return np.asarray(origin_m + query.grid.cell_m * np.array([row, column]))
+def _span(time_s: Array) -> Span:
+    """Return when the overlap's cells (N,) were measured."""
+    mean_s = float(time_s.mean())
+    return Span(mean_s=mean_s, length_s=float(time_s.max() - time_s.min()), age_s=time_s - mean_s)
 
 
-def _span(time_s: Array, both: Array) -> Span:
-    """Return when the overlap's cells were measured, of times that are zero outside."""
-    cells = both.sum()
-    mean_s = float(np.sum(time_s) / cells)
-    inside = time_s[both > 0.0]
-    return Span(
-        mean_s=mean_s,
-        length_s=float(inside.max() - inside.min()),
-        age_s=both * (time_s - mean_s),
-    )
-
-
-def _polynomials(both: Array, cell_m: float) -> Array:
-    """Return 1, n, e, n^2, n e, e^2 over the overlap, centred, in metres; (6, R, C)."""
-    rows, cols = both.shape
-    total = both.sum()
-    n = np.arange(rows) * cell_m
-    e = np.arange(cols) * cell_m
-    n = (n - both.sum(axis=1) @ n / total)[:, None] * both
-    e = (e - both.sum(axis=0) @ e / total)[None, :] * both
-    return np.asarray(np.stack([both, n, e, n * n, n * e, e * e]), dtype=np.float64)
+def _polynomials(n: Array, e: Array) -> Array:
+    """Return 1, n, e, n^2, n e, e^2, of metres from the middle; (6, N)."""
+    return np.stack([np.ones(n.size), n, e, n * n, n * e, e * e])
 
 
 def design_of(field: Aligned, noise: NoiseModel) -> tuple[Array, Array]:
-    """Return the design (p, R, C) and the prior information (p,) of its unknowns.
+    """Return the design (p, N) and the prior information (p,) of its unknowns.
 
     The unknowns are the shift, which has no prior, then those of offset, drift of reference and
     query, tilt and bend whose sigma is not zero, in this order.

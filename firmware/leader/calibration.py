@@ -13,7 +13,7 @@ import numpy as np
 from firmware.geometry import Array
 from firmware.leader.alignment import Aligned, NoiseModel, align, fields_of
 from firmware.leader.refinement import SETTLED_M, limited
-from firmware.leader.screening import land, prepare, sample
+from firmware.leader.screening import prepare, sample
 from firmware.leader.swath import Swath
 from firmware.submaps import GriddedSubmap
 from protocol.settings import Settings, setting
@@ -130,10 +130,9 @@ def _evidence_of(
     shift = np.array(overlap.shift_m, dtype=np.float64)
     for _ in range(_ITERATIONS):
         field = align(reference, query, fields, shift, noise)
-        at = land(reference.grid, query.grid, shift)
-        if field is None or at is None or field.both.sum() < settings.minimum_cells:
+        if field is None or field.cells < settings.minimum_cells:
             return None
-        swath = (sample(tracks[0], at) - tracks[1][:, *at.query]) * field.both
+        swath = (sample(tracks[0], field.at) - tracks[1][:, *field.at.query])[:, field.both]
         system = _system(field, swath, settings)
         system.normal[:2, :2] += inverse
         system.right[:2] += inverse @ (shift - overlap.shift_m)
@@ -167,8 +166,7 @@ class _System:
     def misfit(self, unknowns: Array) -> float:
         """Return the mean of squared normalised residuals."""
         residual = self.difference_m - unknowns @ self.design
-        cells = np.count_nonzero(self.weight)
-        return float(self.redundancy * np.sum(self.weight * residual**2) / cells)
+        return float(self.redundancy * np.mean(self.weight * residual**2))
 
     def evidence(self, misfit: float) -> _Evidence:
         """Return what is left for roll and smile when shift and offset are marginalised."""
@@ -181,17 +179,16 @@ class _System:
 
 def _system(field: Aligned, swath: Array, settings: CalibrationSettings) -> _System:
     slope = 0.5 * (field.slope_r + field.slope_q)
-    design = np.concatenate([slope, field.both[None], swath]).reshape(5, -1)
-    weight = field.weight.ravel() / settings.redundancy
-    difference_m = field.difference_m.ravel()
+    design = np.concatenate([slope, field.basis[:1], swath])
+    weight = 1.0 / (field.variance_m2 * settings.redundancy)
     normal = (design * weight) @ design.T
     normal[2, 2] += settings.wander_m**-2
     return _System(
         design=design,
         weight=weight,
-        difference_m=difference_m,
+        difference_m=field.difference_m,
         normal=normal,
-        right=(design * weight) @ difference_m,
+        right=(design * weight) @ field.difference_m,
         redundancy=settings.redundancy,
     )
 

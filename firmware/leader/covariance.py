@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import fft
 
 from firmware.geometry import Array
@@ -33,10 +34,8 @@ class Refined:
 def measure(field: Aligned, noise: NoiseModel) -> Refined:
     """Return the fit at its optimum with the sandwich covariance."""
     columns, prior = design_of(field, noise)
-    unknowns = solve(field, columns, prior)
-    residual = field.both * (field.difference_m - np.tensordot(unknowns, columns, axes=1))
-    cells = field.both.sum()
-    misfit = float(np.sum(field.weight * residual**2) / cells)
+    residual = field.difference_m - solve(field, columns, prior) @ columns
+    misfit = float(np.mean(residual**2 / field.variance_m2))
     score = _score_covariance(field, columns, residual, max(misfit, 1.0), noise)
     covariance = _sandwich(field, columns, prior, score)
     walk_s = sum(span.length_s / 12.0 for span in field.spans)
@@ -44,8 +43,8 @@ def measure(field: Aligned, noise: NoiseModel) -> Refined:
         shift_m=field.shift_m,
         covariance_m2=covariance,
         walk_m2=noise.walk_m2_per_s * walk_s,
-        variance_m2=float(np.sum(field.variance_m2 * field.both) / cells),
-        overlap_cells=int(cells),
+        variance_m2=float(field.variance_m2.mean()),
+        overlap_cells=field.cells,
         centre_m=field.centre_m,
         reference_time_s=field.spans[0].mean_s,
         query_time_s=field.spans[1].mean_s,
@@ -59,11 +58,9 @@ def _sandwich(field: Aligned, columns: Array, prior: Array, score: Array) -> Arr
     whose noises are independent, so that noise alone makes no information. B is the covariance of
     the score under residuals correlated as they are seen to be, and at least as the model says.
     """
-    p = columns.shape[0]
-    design = columns.reshape(p, -1)
-    weight = field.weight.ravel()
-    curvature = (design * weight) @ design.T
-    cross = (field.slope_r.reshape(2, -1) * weight) @ field.slope_q.reshape(2, -1).T
+    p, weight = len(prior), 1.0 / field.variance_m2
+    curvature = (columns * weight) @ columns.T
+    cross = (field.slope_r * weight) @ field.slope_q.T
     raw = curvature[:2, :2].copy()
     curvature[:2, :2] = 0.5 * (cross + cross.T)
     values, vectors = np.linalg.eigh(curvature[:2, :2])
@@ -92,8 +89,9 @@ def _score_covariance(
     """Return sum_ij u_i C(i - j) u_j' (p, p), where u = weight * column and C is seen in r."""
     shape = field.both.shape
     size = tuple(fft.next_fast_len(2 * n, real=True) for n in shape)
-    root = np.sqrt(field.weight)
-    stack = np.concatenate([[field.both, root * residual], columns * root], axis=0)
+    sigma = np.sqrt(field.variance_m2)
+    stack = np.zeros((2 + len(columns), *shape))
+    stack[:, field.both] = np.vstack([np.ones(sigma.size), residual / sigma, columns / sigma])
     spectrum = fft.rfft2(stack, s=size)
     pairs = fft.irfft2(np.abs(spectrum[0]) ** 2, s=size)
     seen = fft.irfft2(np.abs(spectrum[1]) ** 2, s=size) / np.maximum(pairs, 1.0)
@@ -107,7 +105,7 @@ def _score_covariance(
     return _quadratic(spectrum[2:], power, size)
 
 
-def _quadratic(spectrum: Array, power: Array, size: tuple[int, ...]) -> Array:
+def _quadratic(spectrum: NDArray[np.complex128], power: Array, size: tuple[int, ...]) -> Array:
     """Return Parseval's sum over both halves of the spectrum of u power u', (p, p)."""
     double = np.full(spectrum.shape[2], 2.0)
     double[0] = 1.0

@@ -56,10 +56,9 @@ def limited(move_m: Array) -> Array:
     return np.asarray(move_m * min(1.0, _LONGEST_STEP_M / max(float(np.hypot(*move_m)), 1e-12)))
 
 
-def solve(field: Aligned, columns: Array, prior: Array) -> Array:
+def solve(field: Aligned, design: Array, prior: Array) -> Array:
     """Return the unknowns (p,) that explain the difference."""
-    design = columns.reshape(columns.shape[0], -1)
-    weighted = design * field.weight.ravel()
+    weighted = design / field.variance_m2
     information = weighted @ design.T + np.diag(prior)
     information[:2, :2] += np.eye(2) * 1e-9
-    return np.asarray(np.linalg.solve(information, weighted @ field.difference_m.ravel()))
+    return np.asarray(np.linalg.solve(information, weighted @ field.difference_m))

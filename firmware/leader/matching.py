@@ -217,8 +217,8 @@ def _decide(
     among the repetitions of a pattern: such a pair counts as ambiguous.
     """
     settings, refined = problem.settings, measure(winner.field, problem.noise)
-    square_m2, _, _ = problem.error_at(refined.shift_m, absolute=False)
-    residual, limit = square_m2, settings.residual_noise_ratio * refined.variance_m2
+    square_m2 = residual = winner.residual_m2
+    limit = settings.residual_noise_ratio * refined.variance_m2
     if settings.residual == "absolute":
         residual, _, _ = problem.error_at(refined.shift_m, absolute=True)
         limit = np.sqrt(limit)

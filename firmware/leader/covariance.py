@@ -33,15 +33,13 @@ class Refined:
 
 def measure(field: Aligned, noise: NoiseModel) -> Refined:
     """Return the fit at its optimum with the sandwich covariance."""
-    columns, prior = design_of(field, noise)
-    residual = field.difference_m - solve(field, columns, prior) @ columns
+    design, prior = design_of(field, noise)
+    residual = field.difference_m - solve(field, design, prior) @ design
     misfit = float(np.mean(residual**2 / field.variance_m2))
-    score = _score_covariance(field, columns, residual, max(misfit, 1.0), noise)
-    covariance = _sandwich(field, columns, prior, score)
     walk_s = sum(span.length_s / 12.0 for span in field.spans)
     return Refined(
         shift_m=field.shift_m,
-        covariance_m2=covariance,
+        covariance_m2=_sandwich(field, design, prior, residual, max(misfit, 1.0), noise),
         walk_m2=noise.walk_m2_per_s * walk_s,
         variance_m2=float(field.variance_m2.mean()),
         overlap_cells=field.cells,
@@ -51,15 +49,18 @@ def measure(field: Aligned, noise: NoiseModel) -> Refined:
     )
 
 
-def _sandwich(field: Aligned, columns: Array, prior: Array, score: Array) -> Array:
+def _sandwich(
+    field: Aligned, design: Array, prior: Array, residual: Array, misfit: float, noise: NoiseModel
+) -> Array:
     """Return H^-1 (B + P) H^-1 of the shift, (2, 2).
 
     H is the curvature; its shift block multiplies the slopes of one grid with those of the other,
     whose noises are independent, so that noise alone makes no information. B is the covariance of
-    the score under residuals correlated as they are seen to be, and at least as the model says.
+    the score under residuals correlated as they are seen to be, and at least as the model says; of
+    H^-1 the shift's rows are enough to lay about it.
     """
     p, weight = len(prior), 1.0 / field.variance_m2
-    curvature = (columns * weight) @ columns.T
+    curvature = (design * weight) @ design.T
     cross = (field.slope_r * weight) @ field.slope_q.T
     raw = curvature[:2, :2].copy()
     curvature[:2, :2] = 0.5 * (cross + cross.T)
@@ -67,14 +68,12 @@ def _sandwich(field: Aligned, columns: Array, prior: Array, score: Array) -> Arr
     usable = values > 0.25 * np.einsum("ia,ij,ja->a", vectors, raw, vectors)
     rotated = np.eye(p)
     rotated[:2, :2] = vectors.T
-    keep = np.concatenate([usable, np.ones(p - 2, dtype=bool)])
-    h = (rotated @ (curvature + np.diag(prior)) @ rotated.T)[np.ix_(keep, keep)]
-    b = (rotated @ (score + np.diag(prior)) @ rotated.T)[np.ix_(keep, keep)]
-    inverse = np.linalg.inv(h)
-    covariance = inverse @ b @ inverse.T
-    known = int(usable.sum())
+    kept = rotated[np.concatenate([usable, np.ones(p - 2, dtype=bool)])]
+    inverse = np.linalg.inv(kept @ (curvature + np.diag(prior)) @ kept.T)
+    gain = inverse[: usable.sum()] @ kept
+    scores_m2 = _score_covariance(field, gain @ design, residual, misfit, noise)
     spread = 1e6 * np.eye(2)  # a kilometre: nothing is known in that direction
-    spread[np.ix_(usable, usable)] = covariance[:known, :known]
+    spread[np.ix_(usable, usable)] = scores_m2 + (gain * prior) @ gain.T
     result = vectors @ spread @ vectors.T
     return np.asarray(0.5 * (result + result.T))
 
@@ -86,7 +85,7 @@ def _score_covariance(
     misfit: float,
     noise: NoiseModel,
 ) -> Array:
-    """Return sum_ij u_i C(i - j) u_j' (p, p), where u = weight * column and C is seen in r."""
+    """Return sum_ij u_i C(i - j) u_j' (K, K), where u = weight * column and C is seen in r."""
     shape = field.both.shape
     size = tuple(fft.next_fast_len(2 * n, real=True) for n in shape)
     sigma = np.sqrt(field.variance_m2)
@@ -106,11 +105,11 @@ def _score_covariance(
 
 
 def _quadratic(spectrum: NDArray[np.complex128], power: Array, size: tuple[int, ...]) -> Array:
-    """Return Parseval's sum over both halves of the spectrum of u power u', (p, p)."""
+    """Return Parseval's sum over both halves of the spectrum of u power u', (K, K)."""
     double = np.full(spectrum.shape[2], 2.0)
     double[0] = 1.0
     if size[1] % 2 == 0:
         double[-1] = 1.0
-    flat = spectrum.reshape(spectrum.shape[0], -1)
+    flat = spectrum.reshape(spectrum.shape[0], power.size)
     weight = (power * double).ravel() / (size[0] * size[1])
     return np.asarray(((flat * weight) @ flat.conj().T).real)

@@ -35,9 +35,8 @@ def remove_drift(
     moves_m = -drift_mps[:, None] * np.array([age_s.min(), age_s.max()])
     low = np.floor(np.minimum(moves_m.min(axis=1), 0.0) / grid.cell_m).astype(int)
     high = np.ceil(np.maximum(moves_m.max(axis=1), 0.0) / grid.cell_m).astype(int)
-    rows = np.arange(low[0], grid.depth_m.shape[0] + high[0], dtype=np.float64)
-    cols = np.arange(low[1], grid.depth_m.shape[1] + high[1], dtype=np.float64)
-    row, col = np.meshgrid(rows, cols, indexing="ij")
+    row = np.arange(low[0], grid.depth_m.shape[0] + high[0], dtype=np.float64)[:, None]
+    col = np.arange(low[1], grid.depth_m.shape[1] + high[1], dtype=np.float64)[None, :]
     time_at = _time_plane(grid, known)
     time_s = time_at(row, col)
     for _ in range(_ITERATIONS):
@@ -47,29 +46,31 @@ def remove_drift(
     source_row, source_col = row + step[0], col + step[1]
     if nearest:
         source_row, source_col = np.round(source_row), np.round(source_col)
+    fields = np.stack([grid.depth_m, grid.variance_m2, grid.time_s])
+    depth_m, variance_m2, time_s = bilinear(fields, source_row, source_col)
     return dataclasses.replace(
         grid,
         north0_m=grid.north0_m + low[0] * grid.cell_m,
         east0_m=grid.east0_m + low[1] * grid.cell_m,
-        depth_m=bilinear(grid.depth_m, source_row, source_col),
-        variance_m2=bilinear(grid.variance_m2, source_row, source_col),
-        time_s=bilinear(grid.time_s, source_row, source_col),
+        depth_m=depth_m,
+        variance_m2=variance_m2,
+        time_s=time_s,
     )
 
 
 def bilinear(values: Array, row: Array, col: Array) -> Array:
-    """Return the grid's values at fractional indices; NaN outside and next to unknown cells.
+    """Return values (..., R, C) at fractional indices; NaN outside and next to unknown cells.
 
     A neighbour whose weight is zero is not asked, so whole indices return the cell itself.
     """
-    rows, cols = values.shape
+    *fields, rows, cols = values.shape
     inside = (row >= 0) & (row <= rows - 1) & (col >= 0) & (col <= cols - 1)
     i = np.clip(np.floor(row), 0, max(rows - 2, 0)).astype(np.intp)
     j = np.clip(np.floor(col), 0, max(cols - 2, 0)).astype(np.intp)
     a, b = row - i, col - j
-    flat = values.ravel()
-    corner = i * cols + j
-    total = np.zeros(np.shape(row))
+    flat = values.reshape(*fields, -1)
+    corner = np.where(inside, i * cols + j, 0)
+    total = np.zeros((*fields, *corner.shape))
     down = cols if rows > 1 else 0
     right = 1 if cols > 1 else 0
     for offset, weight in (
@@ -78,7 +79,7 @@ def bilinear(values: Array, row: Array, col: Array) -> Array:
         (right, (1 - a) * b),
         (down + right, a * b),
     ):
-        total += np.where(weight == 0.0, 0.0, flat[np.where(inside, corner + offset, 0)] * weight)
+        total += np.where(weight == 0.0, 0.0, flat.take(corner + offset, axis=-1) * weight)
     return np.where(inside, total, np.nan)
 
 

@@ -84,8 +84,8 @@ def _detrended(layer: Layer) -> Array:
     """Return the depths less their plane, zero where unknown."""
     i, j = np.nonzero(layer.known > 0)
     depth = layer.grid.depth_m[i, j]
-    design = np.column_stack([np.ones(i.size), i - i.mean(), j - j.mean()])
+    design = np.stack([np.ones(i.size), i - i.mean(), j - j.mean()])
     flat = np.zeros(layer.known.shape)
-    normal = design.T @ design + 1e-9 * np.eye(3)
-    flat[i, j] = depth - design @ np.linalg.solve(normal, design.T @ depth)
+    normal = design @ design.T + 1e-9 * np.eye(3)
+    flat[i, j] = depth - np.linalg.solve(normal, design @ depth) @ design
     return flat

@@ -93,18 +93,19 @@ def prepare(grid: GriddedSubmap) -> Layer | None:
     if not rows.size:
         return None
     box = (slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1))
+    known, depth_m, variance_m2 = known[box], grid.depth_m[box], grid.variance_m2[box]
     cropped = dataclasses.replace(
         grid,
         north0_m=grid.north0_m + float(rows[0]) * grid.cell_m,
         east0_m=grid.east0_m + float(cols[0]) * grid.cell_m,
-        depth_m=np.where(known, grid.depth_m, np.nan)[box],
-        variance_m2=np.where(known, grid.variance_m2, np.nan)[box],
+        depth_m=np.where(known, depth_m, np.nan),
+        variance_m2=np.where(known, variance_m2, np.nan),
         time_s=_filled(grid.time_s[box]),
     )
-    mask = known[box].astype(np.float64)
-    weight = mask * np.exp(-np.nan_to_num(cropped.variance_m2)) if grid.reconstructed else mask
-    variance = np.nan_to_num(cropped.variance_m2)
-    map_m2 = mask * (variance - np.nanmin(cropped.variance_m2) if grid.reconstructed else variance)
+    mask, map_m2 = known.astype(np.float64), np.where(known, variance_m2, 0.0)
+    weight = mask
+    if grid.reconstructed:
+        weight, map_m2 = mask * np.exp(-map_m2), map_m2 - mask * map_m2[known].min()
     return Layer(grid=cropped, known=mask, weight=weight, map_m2=map_m2, noise_m2=map_m2)
 
 

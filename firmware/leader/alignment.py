@@ -41,8 +41,12 @@ class Span:
     """When one side of the overlap was measured; age_s (N,) counts from the mean time."""
 
     mean_s: float
-    length_s: float
     age_s: Array
+
+    @property
+    def length_s(self) -> float:
+        """From the first cell to the last."""
+        return float(np.ptp(self.age_s))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -134,7 +138,7 @@ def align(
 def _span(time_s: Array) -> Span:
     """Return when the overlap's cells (N,) were measured."""
     mean_s = float(time_s.mean())
-    return Span(mean_s=mean_s, length_s=float(time_s.max() - time_s.min()), age_s=time_s - mean_s)
+    return Span(mean_s=mean_s, age_s=time_s - mean_s)
 
 
 def _polynomials(n: Array, e: Array) -> Array:

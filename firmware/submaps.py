@@ -29,33 +29,14 @@ class Track:
 
     def position_at(self, time_s: Array | float) -> Array:
         """Return north, east (..., 2) at the times, interpolated, held constant beyond the ends."""
-        times_s = np.asarray(time_s, dtype=np.float64)
-        near = around(self.time_s, times_s)
-        return np.stack(
-            [
-                np.interp(times_s, self.time_s[near], self.north_m[near]),
-                np.interp(times_s, self.time_s[near], self.east_m[near]),
-            ],
-            axis=-1,
-        )
+        axes_m = (self.north_m, self.east_m)
+        return np.stack([np.interp(time_s, self.time_s, axis_m) for axis_m in axes_m], axis=-1)
 
     def gap_s(self, time_s: float) -> float:
         """Return how far the nearest state is from a time."""
         after = int(np.searchsorted(self.time_s, time_s))
         near_s = self.time_s[max(after - 1, 0) : after + 1]
         return float(np.min(np.abs(near_s - time_s)))
-
-
-def around(known_s: Array, wanted_s: Array) -> slice:
-    """Return which of the known times (K,), ascending, wanted ones are interpolated between.
-
-    They are few of a whole day.
-    """
-    if not wanted_s.size:
-        return slice(None)
-    first = int(np.searchsorted(known_s, wanted_s.min(), side="right")) - 1
-    last = int(np.searchsorted(known_s, wanted_s.max(), side="left"))
-    return slice(min(max(first, 0), len(known_s) - 1), last + 1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

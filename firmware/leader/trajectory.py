@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware.geometry import Array
-from firmware.submaps import around
 
 _WINDOW_S = 40.0  # over which drift is the slope of the correction: a sub-map
 
@@ -25,7 +24,7 @@ class Trajectory:
         The correction is interpolated between nodes, and carried on with the newest bias.
         """
         time_s = np.asarray(time_s, dtype=np.float64)
-        near = around(self.time_s, time_s)
+        near = self._around(time_s)
         nodes_s = self.time_s[near]
         correction_m = self.position_m[near] - self.reckoned_m[near]
         ahead_s = np.maximum(time_s - self.time_s[-1], 0.0)
@@ -37,7 +36,7 @@ class Trajectory:
 
     def bias_at(self, time_s: float) -> Array:
         """Return the dead-reckoning bias (2,) in m/s at the time."""
-        near = around(self.time_s, np.asarray(time_s))
+        near = self._around(np.asarray(time_s))
         return np.array(
             [np.interp(time_s, self.time_s[near], self.bias_mps[near, a]) for a in (0, 1)]
         )
@@ -93,3 +92,11 @@ class Trajectory:
                 [self.bias_mps + np.stack(moved[1], axis=-1), nodes.bias_mps[~again]]
             ),
         )
+
+    def _around(self, time_s: Array) -> slice:
+        """Return the nodes between which times are interpolated: few of a whole day."""
+        if not time_s.size:
+            return slice(None)
+        first = int(self.time_s.searchsorted(time_s.min(), side="right")) - 1
+        last = int(self.time_s.searchsorted(time_s.max(), side="left"))
+        return slice(min(max(first, 0), len(self.time_s) - 1), last + 1)

@@ -33,6 +33,30 @@ class Poses:
         return Poses(**{name: getattr(self, name)[pings] for name in self.__slots__})
 
 
+@dataclass(frozen=True, slots=True)
+class _Rays:
+    """Where each of N rays begins, and its unit vector, in NED; all arrays are (N,)."""
+
+    north_m: Array
+    east_m: Array
+    depth_m: Array
+    to_north: Array
+    to_east: Array
+    to_down: Array
+
+    def part(self, rays: NDArray[np.intp]) -> "_Rays":
+        """Return some of the rays."""
+        return _Rays(*(getattr(self, name).take(rays) for name in self.__slots__))
+
+    def gap_m(self, seabed: Seabed, ranges_m: Array) -> Array:
+        """Return the height above the seabed at the ranges (N,)."""
+        return seabed.filled_depth_at(*self.at(ranges_m)) - self.depth_m - ranges_m * self.to_down
+
+    def at(self, ranges_m: Array) -> tuple[Array, Array]:
+        """Return north and east (N,) at the ranges (N,)."""
+        return self.north_m + ranges_m * self.to_north, self.east_m + ranges_m * self.to_east
+
+
 def beam_angles(scenario: ScenarioSettings) -> Array:
     """Return the beams' angles (B,) from the vertical, positive to starboard."""
     half_rad = math.radians(scenario.swath_deg) / 2.0
@@ -104,42 +128,24 @@ def cast_rays(seabed: Seabed, poses: Poses, directions: Array) -> Array:
     on. The last metres are left to the secant. Rays pass over no-data as if it were filled from the
     nearest cell; one that ends there is lost.
     """
-    shape = directions.shape[1:]
-    d_north, d_east, d_down = (np.ascontiguousarray(d).ravel() for d in directions)
-    origin = [np.repeat(v, shape[1]) for v in (poses.north_m, poses.east_m, poses.depth_m)]
-    across = np.hypot(d_north, d_east)
-    going_down = d_down > 0.05
-    reach_m = 0.0
-    if going_down.any():
-        reach_m = float(_reach(seabed, poses, across[going_down] / d_down[going_down]))
+    shape, downward = directions.shape[1:], np.flatnonzero(directions[2] > 0.05)
+    distances_m = np.full(shape, np.nan)
+    if not downward.size:
+        return distances_m
+    origins = (np.repeat(v, shape[1]) for v in (poses.north_m, poses.east_m, poses.depth_m))
+    rays = _Rays(*origins, *directions.reshape(3, -1)).part(downward)
+    across = np.hypot(rays.to_north, rays.to_east)
+    reach_m = _reach(seabed, poses, across / rays.to_down)
     shallowest_m, slope = seabed.shallowest_and_steepest(
         (poses.north_m.min() - reach_m, poses.north_m.max() + reach_m),
         (poses.east_m.min() - reach_m, poses.east_m.max() + reach_m),
     )
-    pace = 1.0 / (d_down + min(slope, STEEPEST) * across)
-    ranges_m = np.maximum(shallowest_m - origin[2], 0.0) * pace
-    ranges_m[~going_down] = np.nan
-    active = np.flatnonzero(going_down)
-    step_m, longest_m = np.zeros(ranges_m.size), np.full(ranges_m.size, np.inf)
-    for _ in range(MOST_STEPS):
-        gap_m = _gap(seabed, origin, (d_north, d_east, d_down), ranges_m, active)
-        inside = gap_m < -NEAR_M
-        into = active[inside]
-        longest_m[into] = 0.5 * np.abs(step_m[into])
-        step_m[active] = np.minimum(gap_m * pace[active], longest_m[active])
-        step_m[into] = -longest_m[into]
-        ranges_m[active] += step_m[active]
-        active = active[np.abs(gap_m) > NEAR_M]
-        if active.size == 0:
-            break
-    rays = np.flatnonzero(going_down)
-    _refine(seabed, origin, (d_north, d_east, d_down), ranges_m, rays)
-    hit_m = ranges_m[rays]
-    known = seabed.depth_at(
-        origin[0][rays] + hit_m * d_north[rays], origin[1][rays] + hit_m * d_east[rays]
-    )
-    ranges_m[rays[np.isnan(known)]] = np.nan
-    distances_m: Array = ranges_m.reshape(shape)
+    pace = 1.0 / (rays.to_down + min(slope, STEEPEST) * across)
+    ranges_m = np.maximum(shallowest_m - rays.depth_m, 0.0) * pace
+    _trace(seabed, rays, pace, ranges_m)
+    _refine(seabed, rays, ranges_m)
+    ranges_m[np.isnan(seabed.depth_at(*rays.at(ranges_m)))] = np.nan
+    distances_m.ravel()[downward] = ranges_m
     return distances_m
 
 
@@ -149,38 +155,33 @@ def _reach(seabed: Seabed, poses: Poses, across_per_down: Array) -> float:
     return max(0.0, deepest_m - float(poses.depth_m.min())) * float(across_per_down.max())
 
 
-def _gap(
-    seabed: Seabed,
-    origin: list[Array],
-    direction: tuple[Array, Array, Array],
-    ranges_m: Array,
-    rays: NDArray[np.intp],
-) -> Array:
-    """Return the height above the seabed at the ranges of the rays."""
-    along_m = ranges_m[rays]
-    depth_m = seabed.filled_depth_at(
-        origin[0][rays] + along_m * direction[0][rays],
-        origin[1][rays] + along_m * direction[1][rays],
-    )
-    return depth_m - origin[2][rays] - along_m * direction[2][rays]
+def _trace(seabed: Seabed, rays: _Rays, pace: Array, ranges_m: Array) -> None:
+    """Move the ranges (N,) of rays to within NEAR_M of the seabed by their paces (N,), in place."""
+    active = np.arange(ranges_m.size)
+    along_m, step_m, longest_m = ranges_m, np.zeros(active.size), np.full(active.size, np.inf)
+    for _ in range(MOST_STEPS):
+        gap_m = rays.gap_m(seabed, along_m)
+        inside = gap_m < -NEAR_M
+        longest_m = np.where(inside, 0.5 * np.abs(step_m), longest_m)
+        step_m = np.where(inside, -longest_m, np.minimum(gap_m * pace, longest_m))
+        along_m = along_m + step_m
+        ranges_m[active] = along_m
+        far = np.flatnonzero(np.abs(gap_m) > NEAR_M)
+        if far.size == 0:
+            break
+        rays, active, pace = rays.part(far), active.take(far), pace.take(far)
+        along_m, step_m, longest_m = along_m.take(far), step_m.take(far), longest_m.take(far)
 
 
-def _refine(
-    seabed: Seabed,
-    origin: list[Array],
-    direction: tuple[Array, Array, Array],
-    ranges_m: Array,
-    rays: NDArray[np.intp],
-) -> None:
-    """Move the ranges of the rays onto the seabed by secant steps, in place."""
-    before_m = ranges_m[rays].copy()
-    gap_before_m = _gap(seabed, origin, direction, ranges_m, rays)
-    ranges_m[rays] += gap_before_m / direction[2][rays]
+def _refine(seabed: Seabed, rays: _Rays, ranges_m: Array) -> None:
+    """Move the ranges (N,) of rays onto the seabed by secant steps, in place."""
+    before_m = ranges_m.copy()
+    gap_before_m = rays.gap_m(seabed, ranges_m)
+    ranges_m += gap_before_m / rays.to_down
     for _ in range(SECANT_STEPS):
-        gap_m = _gap(seabed, origin, direction, ranges_m, rays)
-        now_m = ranges_m[rays]
+        gap_m = rays.gap_m(seabed, ranges_m)
         change_m = gap_before_m - gap_m
         safe = np.abs(change_m) > 1e-9
-        step_m = np.where(safe, gap_m * (now_m - before_m) / np.where(safe, change_m, 1.0), 0.0)
-        before_m, gap_before_m = now_m, gap_m
-        ranges_m[rays] = now_m + np.clip(step_m, -1.0, 1.0)
+        step_m = np.where(safe, gap_m * (ranges_m - before_m) / np.where(safe, change_m, 1.0), 0.0)
+        before_m, gap_before_m = ranges_m.copy(), gap_m
+        ranges_m += np.clip(step_m, -1.0, 1.0)

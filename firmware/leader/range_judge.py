@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
+from scipy.special import softmax
 
 from firmware.geometry import Array
 from firmware.sound_speed import SoundProfile
@@ -61,8 +61,9 @@ class RangeSettings(Settings):
     )
     lost_m: float = setting(50.0, "m", "by how much predictions then miss", minimum=1.0)
     joined: int = setting(
-        20, "ranges", "at most in windows that are joined while they are undecided", minimum=5
-    )
+        20, "ranges", "at most in windows that are joined while they are undecided", minimum=5,
+        maximum=60,
+    )  # fmt: skip
     joined_s: float = setting(
         60.0,
         "s",
@@ -138,10 +139,11 @@ class RangeJudge:
         reach_s = max(float(np.max(np.abs(age_s))), 1e-3)
         seldom_mps = _SELDOM * s.rate_sigma_mps
         rate_mps = _grid(2.0 * seldom_mps, sigma_m / reach_s)
-        as_true, as_stretched = self._densities(
-            np.where(sane, measured_m, np.nan)[:, None, None],
-            predicted_m[:, None, None] + miss_m[:, None] + age_s[:, None, None] * rate_mps,
-            sigma_m,
+        found_m = np.where(sane, measured_m, np.nan)[:, None, None]
+        expected_m = (predicted_m[:, None] + age_s[:, None] * rate_mps)[:, None]
+        as_true, as_stretched = (
+            _density(found_m - factor * expected_m - factor * miss_m[:, None], sigma_m)
+            for factor in (1.0, s.outlier_factor)
         )
         score = _log_prior(miss_m, prior_sigma_m, lost_m, s.lost_share)[:, None] + _log_prior(
             rate_mps, s.rate_sigma_mps, seldom_mps, _SELDOM_SHARE
@@ -167,28 +169,24 @@ class RangeJudge:
         self._seen["true"] += float(np.count_nonzero(verdict.true))
         self._seen["stretched"] += float(np.count_nonzero(verdict.stretched))
 
-    def _densities(
-        self, measured_m: Array, expected_m: Array, sigma_m: float
-    ) -> tuple[Array, Array]:
-        """Return the densities (R, G, V) of each range if it is true, and if it is stretched."""
-        scale, factor = 1.0 / (np.sqrt(2 * np.pi) * sigma_m), self._settings.outlier_factor
-        true = np.exp(-0.5 * ((measured_m - expected_m) / sigma_m) ** 2)
-        stretched = np.exp(-0.5 * ((measured_m - factor * expected_m) / sigma_m) ** 2)
-        return scale * true, scale * stretched
-
     def _log_likelihood(self, as_true: Array, as_stretched: Array) -> Array:
         """Return the log likelihood (G, V) of all ranges over every share that may be the true one.
 
-        The share is as uncertain as what was seen so far leaves it: a beta distribution.
+        The share is as uncertain as what was seen so far leaves it: a beta distribution. The
+        product of the densities of all that may be joined is no less than 1e-240: a double.
         """
         exponents = self._seen["stretched"] - 1.0, self._seen["true"] - 1.0
-        log_weight = exponents[0] * np.log(_SHARES) + exponents[1] * np.log(1.0 - _SHARES)
-        by_share = [
-            np.sum(np.log((1.0 - share) * as_true + share * as_stretched + _WILD_DENSITY), axis=0)
-            for share in _SHARES
-        ]
-        weighted = np.stack(by_share) + (log_weight - logsumexp(log_weight))[:, None, None]
-        return np.asarray(logsumexp(weighted, axis=0))
+        weights = softmax(exponents[0] * np.log(_SHARES) + exponents[1] * np.log(1.0 - _SHARES))
+        likelihood = sum(
+            weight * np.prod((1.0 - share) * as_true + share * as_stretched + _WILD_DENSITY, axis=0)
+            for share, weight in zip(_SHARES, weights, strict=True)
+        )
+        return np.asarray(np.log(likelihood))
+
+
+def _density(missed_m: Array, sigma_m: float) -> Array:
+    """Return the density of ranges that are missed by so much."""
+    return np.asarray(np.exp(missed_m**2 * (-0.5 / sigma_m**2)) / (np.sqrt(2 * np.pi) * sigma_m))
 
 
 def _log_prior(values: Array, sigma: float, wide: float, wide_share: float) -> Array:

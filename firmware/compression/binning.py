@@ -117,7 +117,7 @@ class SoundingBins:
         if late.any():
             if not np.isfinite(self._sigma_m):
                 self._sigma_m = self._noise_m()
-            centre_m = _median(self._held[rows[late]])
+            centre_m = _median(self._held[rows[late]], self._filled[rows[late]])
             gate_m = 2.0 * self._settings.flier_gate * self._sigma_m
             near[late] = np.abs(offset_m[late] - centre_m) <= gate_m
             self._late_fliers += int(np.count_nonzero(~near))
@@ -193,7 +193,8 @@ class SoundingBins:
             )
         sigma_m = self._noise_m()
         held_m = self._held + self._reference_m[:, None]
-        centre_m, spread_m = self._neighbourhood(held_m, sigma_m)
+        begin, end = self._around()
+        centre_m, spread_m = self._neighbourhood(held_m, sigma_m, begin, end)
         gate_m = self._settings.flier_gate * np.hypot(spread_m, sigma_m)
         with np.errstate(invalid="ignore"):
             near = np.abs(held_m - centre_m[:, None]) <= gate_m[:, None]
@@ -209,14 +210,14 @@ class SoundingBins:
         count: Array = near.sum(axis=1).astype(np.float64) + n_sums
         total = offset.sum(axis=1) + np.where(sums_near, self._sums[:, 0], 0.0)
         squares = (offset**2).sum(axis=1) + np.where(sums_near, self._sums[:, 1], 0.0)
-        lone = self._lone(self._filled + self._sums[:, 2])
+        placed = self._filled + self._sums[:, 2]
+        lone = _lone(placed, begin, end)
         self.dropped_fliers = fliers + int(count[lone].sum())
         kept = (count > 0) & ~lone
         count = np.maximum(count, 1.0)
         mean = total / count
         within = np.maximum(squares - count * mean**2, 0.0)
         variance = (within + 4.0 * sigma_m**2) / (count + 3.0) / count
-        placed = self._filled + self._sums[:, 2]
         return BinnedSoundings(
             cell_m=self._cell_m,
             north_m=(self._sums[:, 3] / placed)[kept],
@@ -227,39 +228,30 @@ class SoundingBins:
             time_s=(self._sums[:, 5] / placed)[kept],
         )
 
-    def _neighbourhood(self, held_m: Array, sigma_m: float) -> tuple[Array, Array]:
+    def _around(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return where in the keys the 5 x 5 cells around each begin and end, row by row (5, K)."""
+        lowest = self._keys + np.arange(-2, 3)[:, None] * _ROW_STRIDE - 2
+        return np.searchsorted(self._keys, lowest), np.searchsorted(self._keys, lowest + 5)
+
+    def _neighbourhood(
+        self, held_m: Array, sigma_m: float, begin: NDArray[np.intp], end: NDArray[np.intp]
+    ) -> tuple[Array, Array]:
         """Return the median and robust spread of the cell medians in the 5 x 5 cells around."""
-        with np.errstate(invalid="ignore"):
-            median_m = _median(held_m)
-        centre_m, spread_m = np.empty(self._keys.size), np.empty(self._keys.size)
-        for start in range(0, self._keys.size, _CHUNK):
+        median_m = _median(held_m, self._filled)
+        count = (end - begin).sum(axis=0)
+        centre_m, spread_m = np.empty(count.size), np.empty(count.size)
+        for start in range(0, count.size, _CHUNK):
             part = slice(start, start + _CHUNK)
-            around = self._around(self._keys[part], median_m)
-            centre_m[part] = _median(around)
-            spread_m[part] = _SIGMA_PER_MAD * _median(np.abs(around - centre_m[part, None]))
-            few = np.isfinite(around).sum(axis=1) < 4
-            spread_m[part][few] = np.maximum(spread_m[part][few], 2.0 * sigma_m)
+            rows = begin[:, part, None] + np.arange(5)
+            inside = rows < end[:, part, None]
+            around = np.where(inside, median_m.take(rows, mode="clip"), np.nan)
+            around = np.concatenate(around, axis=1)
+            centre_m[part] = _median(around, count[part])
+            apart_m = np.abs(around - centre_m[part, None])
+            spread_m[part] = _SIGMA_PER_MAD * _median(apart_m, count[part])
+        few = count < 4
+        spread_m[few] = np.maximum(spread_m[few], 2.0 * sigma_m)
         return centre_m, spread_m
-
-    def _lone(self, placed: Array) -> NDArray[np.bool_]:
-        """Return which cells lie almost alone: long echoes fall beyond the swath, cell by cell."""
-        crowd = np.empty(self._keys.size)
-        for start in range(0, self._keys.size, _CHUNK):
-            part = slice(start, start + _CHUNK)
-            crowd[part] = np.nansum(self._around(self._keys[part], placed), axis=1)
-        return np.asarray(crowd < _LONE_SHARE * np.median(crowd))
-
-    def _around(self, keys: NDArray[np.int64], values: Array) -> Array:
-        """Return the values in the 5 x 5 cells around each of the keys, (K, 25), NaN if empty."""
-        around = np.full((keys.size, 25), np.nan)
-        for step in range(5):
-            lowest = keys + (step - 2) * _ROW_STRIDE - 2
-            at = np.searchsorted(self._keys, lowest)
-            for ahead in range(5):
-                row = np.minimum(at + ahead, self._keys.size - 1)
-                inside = (at + ahead < self._keys.size) & (self._keys[row] <= lowest + 4)
-                around[inside, 5 * step + ahead] = values[row[inside]]
-        return around
 
 
 def coarsened(bins: BinnedSoundings, cell_m: float) -> BinnedSoundings:
@@ -308,13 +300,19 @@ def _is_first(ordered: NDArray[np.integer]) -> NDArray[np.bool_]:
     return np.asarray(np.diff(ordered, prepend=ordered[:1] - 1) != 0)
 
 
-def _median(values: NDArray[D]) -> Array:
-    """Return the median of each row without its NaN; every row holds a number."""
+def _median(values: NDArray[D], count: NDArray[np.intp]) -> Array:
+    """Return the median of each row, of which all but so many numbers are NaN."""
     ordered = np.sort(values, axis=1)  # NaN last
-    count = np.isfinite(ordered).sum(axis=1)
     row = np.arange(len(ordered))
     middle: Array = 0.5 * (ordered[row, (count - 1) // 2] + ordered[row, count // 2])
     return middle
+
+
+def _lone(placed: Array, begin: NDArray[np.intp], end: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Return which cells lie almost alone: long echoes fall beyond the swath, cell by cell."""
+    total = np.append(0.0, np.cumsum(placed))
+    crowd = (total[end] - total[begin]).sum(axis=0)
+    return np.asarray(crowd < _LONE_SHARE * np.median(crowd))
 
 
 def _scattered(values: NDArray[D], where: NDArray[np.intp], size: int, fill: float) -> NDArray[D]:

@@ -56,10 +56,10 @@ class _State:
             np.zeros(size, dtype=np.int64),
         )
 
-    def values_m(self) -> Array:
-        middle = self.magnitude + _MIDDLE * np.exp2(self.known_plane)
-        size_m = np.where(self.significant, middle, 0.0) * QUANTUM_M
-        return np.where(self.negative, -size_m, size_m)
+    def values_m(self, of: Integers | slice = slice(None)) -> Array:
+        middle = self.magnitude[of] + _MIDDLE * np.exp2(self.known_plane[of])
+        size_m = np.where(self.significant[of], middle, 0.0) * QUANTUM_M
+        return np.where(self.negative[of], -size_m, size_m)
 
 
 def encode_steps(
@@ -76,6 +76,7 @@ def encode_steps(
     first = int(quanta.max()).bit_length() - 1
     encoder.encode_number(max(first, 0), 5)
     progress = [Progress(code_bytes=len(encoder), missing_m2=float(flat_m @ flat_m))]
+    missing_m2 = flat_m**2
     cutoff = 0
     for plane in range(max(first, 0), -1, -1):
         above = quanta >> plane > 0
@@ -87,7 +88,8 @@ def encode_steps(
             state.magnitude[index] += bits << plane
             state.significant[index] |= bits > 0
             state.known_plane[index] = plane
-            missing = float(np.sum((flat_m - state.values_m()) ** 2))
+            missing_m2[index] = (flat_m[index] - state.values_m(index)) ** 2
+            missing = float(np.sum(missing_m2))
             progress.append(Progress(code_bytes=len(encoder), missing_m2=missing))
             yield
             if len(encoder) > max_bytes:
@@ -169,8 +171,8 @@ def _passes(
     zone = np.minimum(_ZONES * ring // max(cutoff + 1, 1), _ZONES - 1)
     where = level * _ZONES + zone
     new = ~state.significant & (ring <= cutoff)
-    order = np.argsort(-level, kind="stable")
-    fresh = order[new[order]]
+    fresh = np.flatnonzero(new)
+    fresh = fresh[np.argsort(-level[fresh], kind="stable")]
     likely = level[fresh] >= _LIKELY
     refine = np.flatnonzero(state.significant)
     first = (state.magnitude[refine] >> (plane + 1) == 1).astype(np.int64)

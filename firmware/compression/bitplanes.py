@@ -167,17 +167,16 @@ def _passes(
     energy = np.where(state.significant, 4 * sure * sure, 1).reshape(shape)
     for axis in range(2):
         energy = correlate1d(energy, _KERNEL, axis=axis, mode="reflect")
-    level = np.searchsorted(_LEVELS, energy.ravel())
-    zone = np.minimum(_ZONES * ring // max(cutoff + 1, 1), _ZONES - 1)
-    where = level * _ZONES + zone
-    new = ~state.significant & (ring <= cutoff)
-    fresh = np.flatnonzero(new)
-    fresh = fresh[np.argsort(-level[fresh], kind="stable")]
-    likely = level[fresh] >= _LIKELY
+    fresh = np.flatnonzero(~state.significant & (ring <= cutoff))
+    level = np.searchsorted(_LEVELS, energy.ravel()[fresh])
+    order = np.argsort(-level, kind="stable")
+    fresh, level = fresh[order], level[order]
+    zone = np.minimum(_ZONES * ring[fresh] // max(cutoff + 1, 1), _ZONES - 1)
+    where, likely = level * _ZONES + zone, level >= _LIKELY
     refine = np.flatnonzero(state.significant)
     first = (state.magnitude[refine] >> (plane + 1) == 1).astype(np.int64)
     return [
-        (fresh[likely], where[fresh[likely]], False),
+        (fresh[likely], where[likely], False),
         (refine, _REFINE + first, True),
-        (fresh[~likely], where[fresh[~likely]], False),
+        (fresh[~likely], where[~likely], False),
     ]

@@ -1,5 +1,6 @@
 """From the pings of a multibeam sonar to soundings in NED."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,7 +85,7 @@ def soundings_from_ping(
     ranges_m = np.asarray(ping.slant_ranges_m, dtype=np.float64)
     angles_rad = np.asarray(ping.beam_angles_rad, dtype=np.float64)
     pose = (ping.roll_rad, ping.pitch_rad, ping.yaw_rad, ping.depth_m, north_m, east_m)
-    is_somewhere = bool(np.isfinite(pose).all()) and HIGHEST_M <= ping.depth_m <= DEEPEST_M
+    is_somewhere = all(map(math.isfinite, pose)) and HIGHEST_M <= ping.depth_m <= DEEPEST_M
     if ranges_m.ndim != 1 or ranges_m.shape != angles_rad.shape or not is_somewhere:
         return np.empty((0, 3)), ranges_m.size
     with np.errstate(invalid="ignore"):
@@ -94,13 +95,10 @@ def soundings_from_ping(
             & (np.abs(angles_rad) < np.pi / 2)
         )
     ranges_m, angles_rad = ranges_m[good], angles_rad[good]
-    body_m = np.column_stack(
-        [
-            np.full(ranges_m.size, settings.lever_forward_m),
-            ranges_m * np.sin(angles_rad) + settings.lever_starboard_m,
-            ranges_m * np.cos(angles_rad) + settings.lever_down_m,
-        ]
-    )
+    body_m = np.empty((ranges_m.size, 3))
+    body_m[:, 0] = settings.lever_forward_m
+    body_m[:, 1] = ranges_m * np.sin(angles_rad) + settings.lever_starboard_m
+    body_m[:, 2] = ranges_m * np.cos(angles_rad) + settings.lever_down_m
     rotation = rotation_ned_body(ping.roll_rad, ping.pitch_rad, ping.yaw_rad)
-    soundings_ned_m = body_m @ rotation.T + np.array([north_m, east_m, ping.depth_m])
+    soundings_ned_m = body_m @ rotation.T + (north_m, east_m, ping.depth_m)
     return soundings_ned_m, int(good.size - np.count_nonzero(good))

@@ -180,17 +180,18 @@ class DriftFilter:
         """Return the state at a later time."""
         s, interval_s = self._settings, time_s - state.time_s
         alike, kept = np.exp(-interval_s / np.array([s.leader_alike_s, s.walk_memory_s]))
-        transition = np.diag([1.0, 1.0, 1.0, 1.0, alike, alike])
-        transition[:2, 2:4] = interval_s * np.eye(2)
+        transition = _on_both_axes(
+            np.array([[1.0, interval_s, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, alike]])
+        )
         fresh = np.diag([s.odometry_noise**2 * interval_s, 0.0, 1 - alike**2])
         wandered = np.zeros((3, 3))
         wandered[:2, :2] = np.array([[interval_s**2 / 3, interval_s / 2], [interval_s / 2, 1.0]])
         wandered *= interval_s
-        noise = fresh + self._walks[:, None, None] ** 2 * wandered
+        noise = _on_both_axes(fresh + self._walks[:, None, None] ** 2 * wandered)
         return DriftState(
             time_s=time_s,
             means=state.means @ transition.T,
-            covariances=transition @ state.covariances @ transition.T + np.kron(noise, np.eye(2)),
+            covariances=transition @ state.covariances @ transition.T + noise,
             log_weights=self._log_prior + kept * (state.log_weights - self._log_prior),
         )
 
@@ -221,3 +222,10 @@ class DriftFilter:
         variance_m2 = range_m2 + (fresh * one.leader_sigma_m) ** 2 + across_m2**2 / 4
         shared = covariance @ design.T
         return np.array([one.range_m - predicted_m]), design @ shared + variance_m2, shared
+
+
+def _on_both_axes(matrix: Array) -> Array:
+    """Return matrices (..., 3, 3) over (c, b, v) as (..., 6, 6) over north and east of each."""
+    both = np.zeros((*matrix.shape[:-2], 6, 6))
+    both[..., ::2, ::2] = both[..., 1::2, 1::2] = matrix
+    return both

@@ -39,7 +39,7 @@ class SoundingBins:
         self._reference_m: Array = np.empty(0)
         self._held: NDArray[np.float32] = np.empty((0, self._settings.reservoir), dtype=np.float32)
         self._filled: NDArray[np.int64] = np.empty(0, dtype=np.int64)
-        self._waiting = np.empty((_CHUNK, 4))
+        self._waiting = np.empty((4, _CHUNK))  # north, east, depth and time
         self._waiting_count = 0
         self._sigma_m = np.inf  # gate of the sums, known once reservoirs fill
         self.dropped_bad = 0
@@ -56,36 +56,29 @@ class SoundingBins:
         while start < len(soundings_ned_m):
             first = self._waiting_count
             taken = min(_CHUNK - first, len(soundings_ned_m) - start)
-            self._waiting[first : first + taken, :3] = soundings_ned_m[start : start + taken]
-            self._waiting[first : first + taken, 3] = times_s[start : start + taken]
+            part = self._waiting[:, first : first + taken]
+            part[:3] = soundings_ned_m[start : start + taken].T
+            part[3] = times_s[start : start + taken]
             self._waiting_count += taken
             start += taken
             if self._waiting_count == _CHUNK:
                 self._sort_in()
 
     def _sort_in(self) -> None:
-        waiting, self._waiting_count = self._waiting[: self._waiting_count], 0
-        self._add_chunk(waiting[:, :3], waiting[:, 3])
-
-    def _add_chunk(self, soundings_ned_m: Array, times_s: Array) -> None:
+        chunk, self._waiting_count = self._waiting[:, : self._waiting_count], 0
         limit_m = self._cell_m * (_ROW_STRIDE // 4)
-        good = np.all(np.isfinite(soundings_ned_m), axis=1) & np.isfinite(times_s)
-        good &= np.all(np.abs(soundings_ned_m) < limit_m, axis=1)
+        good = (np.abs(chunk[:3]) < limit_m).all(axis=0) & np.isfinite(chunk[3])
         self.dropped_bad += int(good.size - np.count_nonzero(good))
-        soundings_ned_m, times_s = soundings_ned_m[good], times_s[good]
-        if not len(soundings_ned_m):
+        chunk = chunk[:, good]
+        if not chunk.size:
             return
-        self.soundings += len(soundings_ned_m)
-        keys = _keys_of(soundings_ned_m[:, :2], self._cell_m)
-        order = np.argsort(keys, kind="stable")
-        keys, soundings_ned_m, times_s = keys[order], soundings_ned_m[order], times_s[order]
+        self.soundings += chunk.shape[1]
+        keys, chunk = _ordered(_keys_of(chunk[0], chunk[1], self._cell_m), chunk)
         self._make_room(keys[_is_first(keys)])
         while self._keys.size > self._settings.max_cells:
             self._coarsen()
-            keys = _halved(keys)
-            order = np.argsort(keys, kind="stable")
-            keys, soundings_ned_m, times_s = keys[order], soundings_ned_m[order], times_s[order]
-        self._accumulate(np.searchsorted(self._keys, keys), soundings_ned_m, times_s)
+            keys, chunk = _ordered(_halved(keys), chunk)
+        self._accumulate(keys, chunk)
 
     def _make_room(self, keys: NDArray[np.int64]) -> None:
         """Make cells of the keys, ascending, that have none yet."""
@@ -101,45 +94,33 @@ class SoundingBins:
         self._filled = _scattered(self._filled, old, merged.size, 0)
         self._keys = merged
 
-    def _accumulate(self, rows: NDArray[np.intp], soundings_ned_m: Array, times_s: Array) -> None:
+    def _accumulate(self, keys: NDArray[np.int64], chunk: Array) -> None:
         """Add sorted soundings to their cells: into the reservoir while it fills, then the sums."""
-        depth_m = soundings_ned_m[:, 2]
-        rank = _rank(rows)
-        new = (rank == 0) & np.isnan(self._reference_m[rows])
-        self._reference_m[rows[new]] = depth_m[new]
+        north_m, east_m, depth_m, time_s = chunk
+        first = np.flatnonzero(_is_first(keys))
+        cells, counts = np.searchsorted(self._keys, keys[first]), np.diff(first, append=keys.size)
+        new = self._filled[cells] == 0
+        self._reference_m[cells[new]] = depth_m[first[new]]
+        rows = np.repeat(cells, counts)
         offset_m = depth_m - self._reference_m[rows]
-        slot = self._filled[rows] + rank
+        slot = np.arange(keys.size) + np.repeat(self._filled[cells] - first, counts)
         held = slot < self._settings.reservoir
         self._held[rows[held], slot[held]] = offset_m[held]
-        np.maximum.at(self._filled, rows[held], slot[held] + 1)
-        near = np.ones(rows.size, dtype=bool)
-        late = ~held
-        if late.any():
+        self._filled[cells] = np.minimum(self._filled[cells] + counts, self._settings.reservoir)
+        near = held.copy()
+        if not held.all():
             if not np.isfinite(self._sigma_m):
                 self._sigma_m = self._noise_m()
+            late = np.flatnonzero(~held)
             centre_m = _median(self._held[rows[late]], self._filled[rows[late]])
             gate_m = 2.0 * self._settings.flier_gate * self._sigma_m
             near[late] = np.abs(offset_m[late] - centre_m) <= gate_m
             self._late_fliers += int(np.count_nonzero(~near))
-        late &= near
-        if late.any():
-            columns = (
-                offset_m[late],
-                offset_m[late] ** 2,
-                np.ones(np.count_nonzero(late)),
-                soundings_ned_m[late, 0],
-                soundings_ned_m[late, 1],
-                times_s[late],
-            )
-            for column, values in enumerate(columns):
-                self._sums[:, column] += np.bincount(rows[late], values, self._keys.size)
-        if held.any():  # positions and times of held soundings join the sums; depths come later
-            for column, values in (
-                (3, soundings_ned_m[held, 0]),
-                (4, soundings_ned_m[held, 1]),
-                (5, times_s[held]),
-            ):
-                self._sums[:, column] += np.bincount(rows[held], values, self._keys.size)
+        values = (offset_m, offset_m**2, np.ones_like(offset_m), north_m, east_m, time_s)
+        run = np.repeat(np.arange(cells.size), counts)
+        for these, lowest in ((near & ~held, 0), (held, 3)):  # depths of held ones come later
+            for column in range(lowest, 6):
+                self._sums[cells, column] += np.bincount(run, these * values[column])
 
     def _noise_m(self) -> float:
         """Return the robust spread of a sounding, from the first two of each cell."""
@@ -258,7 +239,7 @@ def coarsened(bins: BinnedSoundings, cell_m: float) -> BinnedSoundings:
     """Return the bins gathered into cells of about cell_m; unchanged if they are as coarse."""
     if bins.cell_m >= 0.75 * cell_m or not bins.north_m.size:
         return bins
-    keys = _keys_of(np.column_stack([bins.north_m, bins.east_m]), cell_m)
+    keys = _keys_of(bins.north_m, bins.east_m, cell_m)
     _, inverse = np.unique(keys, return_inverse=True)
     count = np.bincount(inverse, bins.count).astype(np.float64)
 
@@ -278,9 +259,17 @@ def coarsened(bins: BinnedSoundings, cell_m: float) -> BinnedSoundings:
     )
 
 
-def _keys_of(position_m: Array, cell_m: float) -> NDArray[np.int64]:
-    index = np.floor(position_m / cell_m).astype(np.int64) + _ROW_STRIDE // 2
-    return index[:, 0] * _ROW_STRIDE + index[:, 1]
+def _keys_of(north_m: Array, east_m: Array, cell_m: float) -> NDArray[np.int64]:
+    row, column = (
+        np.floor(along_m / cell_m).astype(np.int64) + _ROW_STRIDE // 2
+        for along_m in (north_m, east_m)
+    )
+    return row * _ROW_STRIDE + column
+
+
+def _ordered(keys: NDArray[np.int64], chunk: Array) -> tuple[NDArray[np.int64], Array]:
+    order = np.argsort(keys, kind="stable")
+    return keys[order], chunk[:, order]
 
 
 def _halved(keys: NDArray[np.int64]) -> NDArray[np.int64]:

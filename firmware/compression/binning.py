@@ -74,14 +74,15 @@ class SoundingBins:
             return
         self.soundings += chunk.shape[1]
         keys, chunk = _ordered(_keys_of(chunk[0], chunk[1], self._cell_m), chunk)
-        self._make_room(keys[_is_first(keys)])
+        first = np.flatnonzero(_is_first(keys))
+        self._make_room(keys[first], chunk[2, first])
         while self._keys.size > self._settings.max_cells:
             self._coarsen()
             keys, chunk = _ordered(_halved(keys), chunk)
         self._accumulate(keys, chunk)
 
-    def _make_room(self, keys: NDArray[np.int64]) -> None:
-        """Make cells of the keys, ascending, that have none yet."""
+    def _make_room(self, keys: NDArray[np.int64], depth_m: Array) -> None:
+        """Make cells of the keys, ascending, that have none yet, each about its first depth."""
         at = np.searchsorted(self._keys, keys)
         is_new = np.append(self._keys, -1)[at] != keys
         if not is_new.any():
@@ -89,7 +90,7 @@ class SoundingBins:
         merged = np.insert(self._keys, at[is_new], keys[is_new])
         old = np.searchsorted(merged, self._keys)
         self._sums = _scattered(self._sums, old, merged.size, 0.0)
-        self._reference_m = _scattered(self._reference_m, old, merged.size, np.nan)
+        self._reference_m = np.insert(self._reference_m, at[is_new], depth_m[is_new])
         self._held = _scattered(self._held, old, merged.size, np.nan)
         self._filled = _scattered(self._filled, old, merged.size, 0)
         self._keys = merged
@@ -99,8 +100,6 @@ class SoundingBins:
         north_m, east_m, depth_m, time_s = chunk
         first = np.flatnonzero(_is_first(keys))
         cells, counts = np.searchsorted(self._keys, keys[first]), np.diff(first, append=keys.size)
-        new = self._filled[cells] == 0
-        self._reference_m[cells[new]] = depth_m[first[new]]
         rows = np.repeat(cells, counts)
         offset_m = depth_m - self._reference_m[rows]
         slot = np.arange(keys.size) + np.repeat(self._filled[cells] - first, counts)

@@ -45,6 +45,7 @@ def test_cells_double_when_the_cap_is_reached(survey: Survey) -> None:
     cells = bins.result()
     assert cells.count.size <= 1000
     assert cells.cell_m > 1.0
+    assert cells.count.sum() > 0.99 * len(survey.soundings_ned_m)
     error_m = cells.depth_m - relief_m(cells.north_m, cells.east_m)
     assert np.sqrt(np.mean(error_m**2)) < 0.5
     assert np.all(np.isfinite(cells.variance_m2))

@@ -17,6 +17,7 @@ from firmware.leader.ledger import (
     Entry,
     OdometryRecord,
     PriorRecord,
+    Record,
     SharedDriftRecord,
     SharedWalkRecord,
 )
@@ -47,6 +48,7 @@ class Solver:
         self._factorization = "CHOLESKY"  # until it calls a long chain indeterminate: then QR
         self._isam = _new_isam(self._factorization)
         self._factors: dict[int, gtsam.NonlinearFactor] = {}  # of the ledger, once made
+        self._last = gtsam.KeyGroupMap()  # variables to eliminate last
         self._tree_entries = 0  # of ISAM2 when it was built
 
     def __getstate__(self) -> dict[str, Any]:
@@ -137,15 +139,27 @@ class Solver:
             if entry.active and entry.slot is None:
                 added.push_back(self._factor(number))
                 numbers.append(number)
+                self._note_newest(entry.record)
             elif not entry.active and entry.slot is not None:
                 removed.append(entry.slot)
                 entry.slot = None
-        result = self._isam.update(added, self._fresh, removed)
+        result = self._isam.update(added, self._fresh, removed, self._last)
         for number, slot in zip(numbers, result.getNewFactorsIndices(), strict=True):
             self._ledger[number].slot = slot
         if numbers or removed:
-            self._isam.update()  # a robust weight follows its residual one step late
+            self._isam.update(constrainedKeys=self._last)  # a robust weight lags a step behind
         self._values = self._isam.calculateEstimate()
+
+    def _note_newest(self, record: Record) -> None:
+        """Let a vehicle's parameters, and the node at which its chain ends, be eliminated last.
+
+        What is told next hangs on these, and most questions are about them: either costs as much
+        as all that is eliminated after what it concerns.
+        """
+        if isinstance(record, OdometryRecord):
+            self._last.erase(record.origin)
+            for key in (record.target, record.parameters):
+                self._last.insert2(key, 1)
 
     def _rebuild_by_qr(self, values: gtsam.Values) -> None:
         self._factorization = "QR"
@@ -153,11 +167,13 @@ class Solver:
         self.rebuilds += 1
 
     def _rebuild(self, values: gtsam.Values) -> None:
+        self._last = gtsam.KeyGroupMap()
         for entry in self._ledger.values():
             entry.slot = None
+            self._note_newest(entry.record)
         graph, entries = self._active_factors()
         self._isam = _new_isam(self._factorization)
-        result = self._isam.update(graph, values)
+        result = self._isam.update(graph, values, [], self._last)
         for entry, slot in zip(entries, result.getNewFactorsIndices(), strict=True):
             entry.slot = slot
         self._values = self._isam.calculateEstimate()

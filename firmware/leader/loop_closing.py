@@ -13,7 +13,8 @@ from firmware.leader.closures import Closure, closure_of, gated
 from firmware.leader.judgement import Judgement
 from firmware.leader.match_jobs import Findings, MatchJob, SheetJobs, jobs_for
 from firmware.leader.nonconvexity import Doubt
-from firmware.leader.open_pairs import OpenPairs
+from firmware.leader.offsets import Offsets
+from firmware.leader.open_pairs import OpenPairs, sheets_of
 from firmware.leader.pairing import Calibrations
 from firmware.leader.pose_graph import PoseGraph
 from firmware.leader.settings import LeaderSettings
@@ -59,15 +60,17 @@ class LoopClosing:
             return None
         self._graph.update()
         sheet, settings = self._waiting.popleft(), self._settings.closures
+        turns = self._open.turns(sheet, self._atlas, self._graph)
+        offsets = Offsets(self._graph, expected=sheets_of(turns))
         jobs: list[MatchJob] = []
         try:
-            jobs = jobs_for(sheet, self._atlas, self._graph, settings, self._calibrations)
+            jobs = jobs_for(sheet, self._atlas, self._graph, offsets, settings, self._calibrations)
         except EstimationError:
             self._counters["submaps_unplaceable"] += 1
         except Exception:
             LOG.exception("the matches of %s cannot be made", sheet.id)
             self._counters["submaps_unmatched"] += 1
-        looks = self._open.second_looks(sheet, self._atlas, self._graph, self._calibrations)
+        looks = self._open.second_looks(turns, offsets, self._graph, self._calibrations)
         doubt, self._doubt = self._doubt, None
         self.is_matching = True
         return SheetJobs(sheet=sheet, jobs=(*jobs, *looks), doubt=doubt)

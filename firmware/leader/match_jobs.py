@@ -16,7 +16,7 @@ from firmware.leader.estimate import Estimate
 from firmware.leader.matches import MatchingSettings, MatchOutcome, NoMatch, PairSigmas
 from firmware.leader.matching import match
 from firmware.leader.nonconvexity import Doubt
-from firmware.leader.offsets import Offset, anchor_of, corrections, offsets_of
+from firmware.leader.offsets import Offset, Offsets, anchor_of, corrections
 from firmware.leader.pairing import Calibrations, Side, side_of, strain_m
 from firmware.submaps import GriddedSubmap
 
@@ -119,6 +119,7 @@ def jobs_for(
     sheet: Sheet,
     atlas: Atlas,
     estimate: Estimate,
+    offsets: Offsets,
     settings: ClosureSettings,
     calibrations: Calibrations,
 ) -> list[MatchJob]:
@@ -127,7 +128,7 @@ def jobs_for(
     Pairs that the estimate knows well teach the calibrations first; then what the sonars do wrong
     is taken out of all. Raises EstimationError if the sheet itself hangs on no node.
     """
-    chosen = _worth_trying(_ranked(sheet, atlas, estimate, settings), settings)
+    chosen = _worth_trying(_ranked(sheet, atlas, estimate, offsets, settings), settings)
     return _jobs(sheet, chosen, estimate, settings, calibrations, learn=True)
 
 
@@ -172,7 +173,7 @@ def _without_hint(offset: Offset, hint: int, estimate: Estimate) -> Offset:
 
 
 def _ranked(
-    sheet: Sheet, atlas: Atlas, estimate: Estimate, settings: ClosureSettings
+    sheet: Sheet, atlas: Atlas, estimate: Estimate, offsets: Offsets, settings: ClosureSettings
 ) -> list[Offset]:
     """Return how a new sheet lies to those that it may overlap, most overlap first."""
     others = [
@@ -192,7 +193,7 @@ def _ranked(
     distances_m = np.hypot(*(centres_m - sheet.centre_m - moves_m[0]).T)
     nearest = np.argsort(distances_m, kind="stable")[: settings.screened_per_submap]
     ranked = []
-    for offset in offsets_of([(others[k], sheet) for k in nearest], estimate):
+    for offset in offsets.of([(others[k], sheet) for k in nearest]):
         shifts_m = offset.shift_m + _spread(offset.covariance_m2)
         area_m2 = overlap_m2(offset.origin, sheet, shifts_m).mean()
         if area_m2 >= settings.expected_overlap_m2:

@@ -1,7 +1,8 @@
 """Where sheets lie by the estimate, and their offsets from each other before any match."""
 
 import contextlib
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -63,43 +64,60 @@ def _worst_m(covariance_m2: Array) -> float:
     return float(np.sqrt(max(np.linalg.eigvalsh(covariance_m2)[-1], 0.0)))
 
 
-def offsets_of(pairs: Sequence[tuple[Sheet, Sheet]], estimate: Estimate) -> list[Offset]:
-    """Return the offset of the second sheet of each pair from the first.
+class Offsets:
+    """Offsets of sheets by an estimate that stays as it is meanwhile.
 
-    All share one joint covariance: that is what costs. Pairs with a sheet that hangs on no node
-    are left out: frames were lost there. Raises EstimationError if the information matrix is
-    singular.
+    All that are asked for share one joint covariance with the sheets that are `expected` to be
+    asked for next: that is what costs.
     """
-    sheets = {sheet.id: sheet for pair in pairs for sheet in pair}
-    anchors = dict[SheetId, Anchor]()
-    for sheet in sheets.values():
-        with contextlib.suppress(EstimationError):
-            anchors[sheet.id] = anchor_of(sheet, estimate)
-    placed = [pair for pair in pairs if all(sheet.id in anchors for sheet in pair)]
-    if not placed:
-        return []
-    rows = {sheet_id: row for row, sheet_id in enumerate(anchors)}
-    ends = np.array([[rows[origin.id], rows[target.id]] for origin, target in placed])
-    joint = estimate.state_covariance(list(anchors.values()))
-    both = joint[ends[:, :, None], :, ends[:, None, :], :]  # (pairs, end, end, 4, 4)
-    both = both.swapaxes(2, 3).reshape(-1, 8, 8)
-    covariances_m2 = _BETWEEN @ both @ _BETWEEN.T
-    known = np.linalg.inv(covariances_m2 + _TINY_M2 * np.eye(2))
-    gains = _DRIFTS @ both @ _BETWEEN.T @ known
-    told = gains @ covariances_m2 @ gains.swapaxes(1, 2)
-    left = _DRIFTS @ both @ _DRIFTS.T - told
-    moves_m = corrections([sheets[sheet_id] for sheet_id in anchors], estimate)
-    return [
-        Offset(
-            origin=origin,
-            target=target,
-            shift_m=moves_m[end[1]] - moves_m[end[0]],
-            covariance_m2=covariances_m2[k],
-            apart_m2=anchors[origin.id].apart_m2 + anchors[target.id].apart_m2,
-            drifts=Drifts(gain=gains[k], left=left[k]),
-        )
-        for k, ((origin, target), end) in enumerate(zip(placed, ends, strict=True))
-    ]
+
+    def __init__(self, estimate: Estimate, expected: Sequence[Sheet] = ()) -> None:
+        self._estimate, self._expected = estimate, expected
+        self._sheets: dict[SheetId, Sheet] = {}
+        self._anchors: dict[SheetId, Anchor] = {}  # of those that hang on a node
+        self._joint: Array | None = None  # of the anchors, in their order
+
+    def of(self, pairs: Sequence[tuple[Sheet, Sheet]]) -> list[Offset]:
+        """Return the offset of the second sheet of each pair from the first.
+
+        Pairs with a sheet that hangs on no node are left out: frames were lost there. Raises
+        EstimationError if the information matrix is singular.
+        """
+        self._place(itertools.chain(self._expected, *pairs))
+        placed = [pair for pair in pairs if all(sheet.id in self._anchors for sheet in pair)]
+        if not placed:
+            return []
+        if self._joint is None:
+            self._joint = self._estimate.state_covariance(list(self._anchors.values()))
+        rows = {sheet_id: row for row, sheet_id in enumerate(self._anchors)}
+        ends = np.array([[rows[origin.id], rows[target.id]] for origin, target in placed])
+        both = self._joint[ends[:, :, None], :, ends[:, None, :], :]  # (pairs, end, end, 4, 4)
+        both = both.swapaxes(2, 3).reshape(-1, 8, 8)
+        covariances_m2 = _BETWEEN @ both @ _BETWEEN.T
+        known = np.linalg.inv(covariances_m2 + _TINY_M2 * np.eye(2))
+        gains = _DRIFTS @ both @ _BETWEEN.T @ known
+        told = gains @ covariances_m2 @ gains.swapaxes(1, 2)
+        left = _DRIFTS @ both @ _DRIFTS.T - told
+        moves_m = corrections([self._sheets[sheet_id] for sheet_id in rows], self._estimate)
+        return [
+            Offset(
+                origin=origin,
+                target=target,
+                shift_m=moves_m[end[1]] - moves_m[end[0]],
+                covariance_m2=covariances_m2[k],
+                apart_m2=self._anchors[origin.id].apart_m2 + self._anchors[target.id].apart_m2,
+                drifts=Drifts(gain=gains[k], left=left[k]),
+            )
+            for k, ((origin, target), end) in enumerate(zip(placed, ends, strict=True))
+        ]
+
+    def _place(self, sheets: Iterable[Sheet]) -> None:
+        """Find the anchors of sheets, and forget the joint covariance where some are new."""
+        for sheet in sheets:
+            if sheet.id not in self._sheets:
+                self._sheets[sheet.id], self._joint = sheet, None
+                with contextlib.suppress(EstimationError):
+                    self._anchors[sheet.id] = anchor_of(sheet, self._estimate)
 
 
 def anchor_of(sheet: Sheet, estimate: Estimate) -> Anchor:

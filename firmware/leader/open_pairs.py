@@ -16,7 +16,7 @@ from firmware.leader.closures import enter_hint
 from firmware.leader.judgement import Judgement
 from firmware.leader.match_jobs import MatchJob, jobs_again
 from firmware.leader.matches import MatchOutcome, NoMatch
-from firmware.leader.offsets import offsets_of
+from firmware.leader.offsets import Offsets
 from firmware.leader.pairing import Calibrations
 from firmware.leader.pose_graph import PoseGraph
 from protocol.errors import EstimationError
@@ -36,6 +36,10 @@ class OpenPair:
 
     radius_m: float
     hint: int | None = None
+
+
+Turn = tuple[Sheet, list[tuple[Sheet, OpenPair]]]
+"""A sheet to look at again, and its partners."""
 
 
 class OpenPairs:
@@ -79,30 +83,30 @@ class OpenPairs:
             self._of.pop(target, None)
 
     def second_looks(
-        self, sheet: Sheet, atlas: Atlas, graph: PoseGraph, calibrations: Calibrations
+        self, turns: list[Turn], offsets: Offsets, graph: PoseGraph, calibrations: Calibrations
     ) -> list[MatchJob]:
         """Return matches of open pairs whose offset is known better by now, beside a new sheet.
 
         Once there are as many as the new sheet may have, the other sheets keep their turn.
         """
-        turns, looks = self.turns(sheet, atlas, graph), list[MatchJob]()
+        looks = list[MatchJob]()
         pairs = [(partner, target) for target, partners in turns for partner, _ in partners]
         try:
-            offsets = {(o.origin.id, o.target.id): o for o in offsets_of(pairs, graph)}
+            found = {(o.origin.id, o.target.id): o for o in offsets.of(pairs)}
         except EstimationError:
-            offsets = {}
+            found = {}
         except Exception:
             LOG.exception("the offsets of open pairs were not found")
             self.counters["second_looks_raised"] += 1
-            offsets = {}
+            found = {}
         for target, partners in turns:
             if len(looks) >= self._settings.pairs_per_submap:
                 break
             self._of.move_to_end(target.id)
             known = [
-                (offsets[partner.id, target.id], pair.radius_m, pair.hint)
+                (found[partner.id, target.id], pair.radius_m, pair.hint)
                 for partner, pair in partners
-                if (partner.id, target.id) in offsets
+                if (partner.id, target.id) in found
             ]
             self.counters["second_looks_unplaceable"] += not known
             try:
@@ -113,16 +117,14 @@ class OpenPairs:
         self.counters["second_looks"] += len(looks)
         return looks
 
-    def turns(
-        self, beside: Sheet, atlas: Atlas, graph: PoseGraph
-    ) -> list[tuple[Sheet, list[tuple[Sheet, OpenPair]]]]:
+    def turns(self, beside: Sheet, atlas: Atlas, graph: PoseGraph) -> list[Turn]:
         """Return the sheets that were not looked at for longest, with the partners of each.
 
         The sheet that they go beside is left out. Sheets that are matched no more are
         forgotten. A partner whose hint was composed with others is passed over: nobody knows any
         more what the pair itself has told.
         """
-        turns = list[tuple[Sheet, list[tuple[Sheet, OpenPair]]]]()
+        turns = list[Turn]()
         for target, pairs in list(self._of.items()):
             if len(turns) == self._settings.second_looks:
                 break
@@ -178,6 +180,13 @@ class OpenPairs:
 
     def __len__(self) -> int:
         return len(self._of)
+
+
+def sheets_of(turns: list[Turn]) -> list[Sheet]:
+    """Return the sheets that have a turn, and their partners."""
+    return [
+        s for target, partners in turns for s in (target, *(partner for partner, _ in partners))
+    ]
 
 
 def _ends_of(job: MatchJob) -> Ends:

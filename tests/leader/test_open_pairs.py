@@ -16,7 +16,7 @@ from firmware.leader.judgement import Judgement, JudgementSettings
 from firmware.leader.loop_closing import LoopClosing
 from firmware.leader.match_jobs import MatchJob, jobs_again
 from firmware.leader.matches import ANY_PAIR, Hint, Match, MatchingSettings, MatchOutcome, NoMatch
-from firmware.leader.offsets import offsets_of
+from firmware.leader.offsets import Offsets
 from firmware.leader.open_pairs import OpenPairs
 from firmware.leader.pairing import Calibrations
 from firmware.leader.pose_graph import PoseGraph
@@ -87,6 +87,11 @@ def _assert_turn(
     assert pair.radius_m == pytest.approx(radius_m)
 
 
+def _second_looks(pairs: OpenPairs, sheet: Sheet, atlas: Atlas, graph: PoseGraph) -> list[MatchJob]:
+    turns, calibrations = pairs.turns(sheet, atlas, graph), Calibrations(MatchingSettings())
+    return pairs.second_looks(turns, Offsets(graph), graph, calibrations)
+
+
 def _sheets(atlas: Atlas) -> list[Sheet]:
     return list(atlas)
 
@@ -123,7 +128,7 @@ def test_sheets_take_turns_and_shelved_ones_are_left_out(atlas: Atlas, graph: Po
     turns = []
     for _ in range(3):
         turns += [target for target, _ in pairs.turns(_sheet(9), atlas, graph)]
-        pairs.second_looks(_sheet(9), atlas, graph, Calibrations(MatchingSettings()))
+        _second_looks(pairs, _sheet(9), atlas, graph)
     assert turns == [second, fourth, second]
 
 
@@ -158,7 +163,7 @@ def _two_sheets() -> tuple[Sheet, Sheet]:
 def _looks(graph: PoseGraph, then_m: float, hint: int | None = None) -> list[MatchJob]:
     origin, target = _two_sheets()
     calibrations = Calibrations(MatchingSettings())
-    (offset,) = offsets_of([(origin, target)], graph)
+    (offset,) = Offsets(graph).of([(origin, target)])
     return jobs_again(target, [(offset, then_m, hint)], graph, ClosureSettings(), calibrations)
 
 
@@ -197,7 +202,7 @@ def test_what_the_pair_itself_has_told_does_not_make_it_better_known(graph: Pose
 def test_what_is_taken_out_of_an_offset_leaves_the_composed_past_as_unsure_as_it_was(
     graph: PoseGraph,
 ) -> None:
-    (offset,) = offsets_of([_two_sheets()], graph)
+    (offset,) = Offsets(graph).of([_two_sheets()])
     apart_m2, told_m2 = np.diag([30.0, 50.0]), np.array([[20.0, 5.0], [5.0, 40.0]])
     open_m2, told_m = offset.covariance_m2, np.array([7.0, -4.0])
     both_m2 = np.linalg.inv(np.linalg.inv(open_m2) + np.linalg.inv(told_m2))
@@ -216,19 +221,36 @@ def test_pairs_with_a_sheet_on_no_node_are_left_out_and_ways_to_nodes_add_up(
 ) -> None:
     first, second = _two_sheets()
     lost = dataclasses.replace(first, id=dataclasses.replace(first.id, vehicle=1))
-    assert offsets_of([(lost, second)], graph) == []
+    assert Offsets(graph).of([(lost, second)]) == []
     graph.lose(0, 19.0, 23.0)
     graph.lose(0, 101.0, 107.0)
-    (offset,) = offsets_of([(first, lost), (first, second)], graph)
+    (offset,) = Offsets(graph).of([(first, lost), (first, second)])
     assert (offset.origin, offset.target) == (first, second)
     ways_m2 = [graph.anchor(0, sheet.time_s, sheet.track).apart_m2 for sheet in (first, second)]
     assert ways_m2[0][0, 0] > ways_m2[1][0, 0] > 0.0
     assert offset.apart_m2 == pytest.approx(ways_m2[0] + ways_m2[1])
 
 
+def test_sheets_expected_to_be_asked_for_share_the_first_covariance(
+    graph: PoseGraph, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = _two_sheets()
+    third = dataclasses.replace(first, id=dataclasses.replace(first.id, submap=7), time_s=50.0)
+    (alone,) = Offsets(graph).of([(first, second)])
+    asked = MagicMock(side_effect=graph.state_covariance)
+    monkeypatch.setattr(graph, "state_covariance", asked)
+    offsets = Offsets(graph, expected=[first, second])
+    offsets.of([(third, second)])
+    (offset,) = offsets.of([(first, second)])
+    assert asked.call_count == 1
+    assert offset.covariance_m2 == pytest.approx(alone.covariance_m2, rel=1e-9)
+    offsets.of([(_sheet(8, 70.0), second)])
+    assert asked.call_count == 2
+
+
 def test_offset_tells_drift_as_the_time_between_the_sheets_says(graph: PoseGraph) -> None:
     origin, target = _two_sheets()
-    (offset,) = offsets_of([(origin, target)], graph)
+    (offset,) = Offsets(graph).of([(origin, target)])
     apart_s, known_m2 = target.time_s - origin.time_s, offset.covariance_m2
     assert offset.drifts.gain == pytest.approx(np.tile(-np.eye(2) / apart_s, (2, 1)), rel=0.1)
     drifts = offset.drifts.covariance(known_m2)
@@ -268,10 +290,9 @@ def test_no_sheet_has_two_turns_beside_a_new_one(atlas: Atlas, graph: PoseGraph)
     for target in (second, third):
         pairs.note(_job(first, target, 16.0), AMBIGUOUS)
     atlas.shelve(second.id)
-    calibrations = Calibrations(MatchingSettings())
-    pairs.second_looks(fourth, atlas, graph, calibrations)
+    _second_looks(pairs, fourth, atlas, graph)
     assert len(pairs) == 1
-    assert pairs.second_looks(third, atlas, graph, calibrations) == []
+    assert _second_looks(pairs, third, atlas, graph) == []
 
 
 def test_a_second_look_that_raises_takes_nothing_else_along(
@@ -305,7 +326,7 @@ def test_offsets_that_raise_leave_a_sheet_its_first_looks(
     closing = LoopClosing(graph, atlas, LeaderSettings())
     closing._open.note(_job(first, second, 1e6), AMBIGUOUS)
     closing.add(third)
-    monkeypatch.setattr(open_pairs, "offsets_of", MagicMock(side_effect=ValueError("no such row")))
+    monkeypatch.setattr(Offsets, "of", MagicMock(side_effect=ValueError("no such row")))
     assert closing.next_jobs() is not None
     assert closing.status()["second_looks_raised"] == 1
 

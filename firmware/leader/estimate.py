@@ -286,19 +286,20 @@ class Estimate:
 
     def _anchored_covariance(self, nodes: list[int], anchors: list[Anchor]) -> Array:
         """Return the joint covariance of the states (4,) of nodes and then of anchors."""
-        keys = list(dict.fromkeys([*nodes, *(anchor.key for anchor in anchors)]))
+        ends = [*nodes, *(anchor.key for anchor in anchors)]
+        keys = list(dict.fromkeys(ends))
         parameters = list(dict.fromkeys(anchor.parameters for anchor in anchors))
+        first = {key: 4 * k for k, key in enumerate(keys)}
+        first |= {key: 4 * len(keys) + 2 * k for k, key in enumerate(parameters)}
         self.update()
         joint = self._solver.covariance([*keys, *parameters])
-        rows = np.zeros((len(nodes) + len(anchors), 4, len(joint)))
-        for row, key in zip(rows, [*nodes, *(anchor.key for anchor in anchors)], strict=True):
-            first = 4 * keys.index(key)
-            row[:, first : first + 4] = np.eye(4)
+        rows, whole = np.zeros((len(ends), 4, len(joint))), np.eye(4)
+        for row, key in zip(rows, ends, strict=True):
+            row[:, first[key] : first[key] + 4] = whole
         for row, anchor in zip(rows[len(nodes) :], anchors, strict=True):
-            first = 4 * keys.index(anchor.key)
-            row[_POSITION, first : first + 4] = anchor.by_state
-            first = 4 * len(keys) + 2 * parameters.index(anchor.parameters)
-            row[_POSITION, first : first + 2] = -anchor.turning
+            state, turned = first[anchor.key], first[anchor.parameters]
+            row[_POSITION, state : state + 4] = anchor.by_state
+            row[_POSITION, turned : turned + 2] = -anchor.turning
         by_all = rows.reshape(-1, len(joint))
         covariance = by_all @ joint @ by_all.T
         for k, anchor in enumerate(anchors, start=len(nodes)):

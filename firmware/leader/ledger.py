@@ -38,7 +38,7 @@ class Anchor:
     @property
     def by_state(self) -> Array:
         """How the position moves with the node's state, (2, 4)."""
-        return np.hstack([np.eye(2), -self.lag_s * np.eye(2)])
+        return np.array([[1.0, 0.0, -self.lag_s, 0.0], [0.0, 1.0, 0.0, -self.lag_s]])
 
     @property
     def turning(self) -> Array:

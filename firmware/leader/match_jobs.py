@@ -192,10 +192,9 @@ def _ranked(
     centres_m = np.array([other.centre_m for other in others]) + moves_m[1:]
     distances_m = np.hypot(*(centres_m - sheet.centre_m - moves_m[0]).T)
     nearest = np.argsort(distances_m, kind="stable")[: settings.screened_per_submap]
-    ranked = []
-    for offset in offsets.of([(others[k], sheet) for k in nearest]):
-        shifts_m = offset.shift_m + _spread(offset.covariance_m2)
-        area_m2 = overlap_m2(offset.origin, sheet, shifts_m).mean()
+    ranked, known = [], offsets.of([(others[k], sheet) for k in nearest])
+    for offset, spread_m in zip(known, _spreads([o.covariance_m2 for o in known]), strict=True):
+        area_m2 = overlap_m2(offset.origin, sheet, offset.shift_m + spread_m).mean()
         if area_m2 >= settings.expected_overlap_m2:
             ranked.append((area_m2, offset))
     ranked.sort(key=lambda item: -item[0])
@@ -213,12 +212,12 @@ def _worth_trying(ranked: list[Offset], settings: ClosureSettings) -> list[Offse
     return chosen[: settings.pairs_per_submap]
 
 
-def _spread(covariance_m2: Array) -> Array:
-    """Return nine shifts (9, 2): none, and one and two sigmas each way along both axes."""
-    values, axes = np.linalg.eigh(covariance_m2)
-    arms_m = axes * np.sqrt(np.maximum(values, 0.0))
+def _spreads(covariances_m2: list[Array]) -> Array:
+    """Return nine shifts each (N, 9, 2): none, one and two sigmas each way along both axes."""
+    values, axes = np.linalg.eigh(np.reshape(covariances_m2, (-1, 2, 2)))
+    arms_m = axes * np.sqrt(np.maximum(values, 0.0))[:, None]
     steps = np.array([[0, 0], [1, 0], [-1, 0], [2, 0], [-2, 0], [0, 1], [0, -1], [0, 2], [0, -2]])
-    return np.asarray(steps @ arms_m.T)
+    return np.asarray(steps @ arms_m.swapaxes(1, 2))
 
 
 def _jobs(

@@ -46,7 +46,7 @@ class Solver:
         self._values = gtsam.Values()
         self._fresh = gtsam.Values()
         self._factorization = "CHOLESKY"  # until it calls a long chain indeterminate: then QR
-        self._isam = _new_isam(self._factorization)
+        self._begin()
         self._factors: dict[int, gtsam.NonlinearFactor] = {}  # of the ledger, once made
         self._last = gtsam.KeyGroupMap()  # variables to eliminate last
         self._tree_entries = 0  # of ISAM2 when it was built
@@ -58,9 +58,8 @@ class Solver:
         """
         if self._changed or self._fresh.size():
             raise TypeError("the ledger has news that ISAM2 does not know")
-        about = self._isam.getLinearizationPoint()
         state = {name: self.__dict__[name] for name in _PLAIN}
-        return state | {"about": {key: about.atVector(key) for key in about.keys()}}
+        return state | {"about": {key: self._about.atVector(key) for key in self._about.keys()}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         about = values_of(state.pop("about"))
@@ -132,6 +131,15 @@ class Solver:
         except RuntimeError as error:
             raise EstimationError("the information matrix is singular") from error
 
+    def _begin(self) -> None:
+        """Begin with an empty ISAM2.
+
+        The point about which it is linearised is held, lest each factor that is written in Python
+        be handed a copy of it: all variables, for every factor.
+        """
+        self._isam = _new_isam(self._factorization)
+        self._about = self._isam.getLinearizationPoint()
+
     def _increment(self) -> None:
         added, numbers, removed = gtsam.NonlinearFactorGraph(), [], []
         for number in sorted(self._changed):
@@ -172,7 +180,7 @@ class Solver:
             entry.slot = None
             self._note_newest(entry.record)
         graph, entries = self._active_factors()
-        self._isam = _new_isam(self._factorization)
+        self._begin()
         result = self._isam.update(graph, values, [], self._last)
         for entry, slot in zip(entries, result.getNewFactorsIndices(), strict=True):
             entry.slot = slot

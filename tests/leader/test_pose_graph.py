@@ -156,6 +156,13 @@ def test_graph_outlives_a_rebuild_that_fails(monkeypatch: pytest.MonkeyPatch) ->
     assert graph.trajectory(0).time_s[-1] == 400.0
 
 
+def test_factors_are_handed_the_very_point_about_which_the_solver_is_linearised() -> None:
+    """Else gtsam's binding copies it, for each factor again."""
+    graph = started(walk(np.random.default_rng(6), 100, 0.3)[0])
+    graph.update()
+    assert graph._solver._isam.getLinearizationPoint() is graph._solver._about
+
+
 def test_gap_in_a_track_is_bridged_by_composed_positions() -> None:
     track, _ = walk(np.random.default_rng(5), 300, 0.0)
     kept = (track.time_s < 100) | (track.time_s > 180)

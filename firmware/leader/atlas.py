@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from firmware.geometry import Array
 from firmware.leader.shelf import MemoryShelf, Shelf, packed, unpacked
@@ -72,7 +73,8 @@ def sheet_of(sheet_id: SheetId, track: Track, grid: GriddedSubmap) -> Sheet | No
     known_m = np.column_stack(
         [grid.north0_m + grid.cell_m * rows, grid.east0_m + grid.cell_m * columns]
     )
-    tiles_m = (np.unique(np.floor(known_m / FOOTPRINT_M), axis=0) + 0.5) * FOOTPRINT_M
+    low, occupied = _occupancy(known_m)
+    tiles_m = ((low + np.argwhere(occupied)).astype(np.float64) + 0.5) * FOOTPRINT_M
     return Sheet(
         id=sheet_id,
         track=track,
@@ -90,15 +92,21 @@ def overlap_m2(origin: Sheet, target: Sheet, shifts_m: Array) -> Array:
     ends_m = target.tiles_m.max(axis=0) + shifts_m.max(axis=0)
     if np.any(begins_m > last_m + FOOTPRINT_M) or np.any(ends_m < first_m - FOOTPRINT_M):
         return np.zeros(len(shifts_m))  # so are most, and this is soon told
-    low = np.floor(first_m / FOOTPRINT_M).astype(int)
-    cells = np.floor(origin.tiles_m / FOOTPRINT_M).astype(int) - low
-    occupied = np.zeros(cells.max(axis=0) + 1, dtype=bool)
-    occupied[cells[:, 0], cells[:, 1]] = True
+    low, occupied = _occupancy(origin.tiles_m)
     moved = target.tiles_m[None] + shifts_m[:, None]
     i, j = np.moveaxis(np.floor(moved / FOOTPRINT_M).astype(int) - low, -1, 0)
     inside = (i >= 0) & (j >= 0) & (i < occupied.shape[0]) & (j < occupied.shape[1])
     hit = inside & occupied[np.where(inside, i, 0), np.where(inside, j, 0)]
     return np.asarray(FOOTPRINT_M**2 * hit.sum(axis=1))
+
+
+def _occupancy(places_m: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Return the lowest tile (2,) that holds places (N, 2), and from there on which tiles do."""
+    tiles = np.floor(places_m / FOOTPRINT_M).astype(int)
+    low = tiles.min(axis=0)
+    occupied = np.zeros(tiles.max(axis=0) - low + 1, dtype=bool)
+    occupied[tuple((tiles - low).T)] = True
+    return low, occupied
 
 
 class Atlas:

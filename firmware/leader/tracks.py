@@ -57,7 +57,7 @@ class TrackBuffer:
     def forget_from(self, time_s: float) -> None:
         """Forget the states from a time on: the clock was set back to it."""
         self.track()
-        self._columns = self._columns[:, self._columns[0] < time_s]
+        self._columns = np.ascontiguousarray(self._columns[:, self._columns[0] < time_s])
         self._states = {
             quarter: state for quarter, state in self._states.items() if state[0] < time_s
         }
@@ -71,7 +71,7 @@ class TrackBuffer:
             merged = np.concatenate([self._columns, rows], axis=1)
             if self._columns.size and rows[0, 0] < self._columns[0, -1]:
                 merged = merged[:, np.argsort(merged[0], kind="stable")]
-            self._columns = merged
+            self._columns = np.ascontiguousarray(merged)  # or each look-up copies a day
         time_s, north_m, east_m, yaw_rad = self._columns
         return Track(time_s=time_s, north_m=north_m, east_m=east_m, yaw_rad=yaw_rad)
 

@@ -38,6 +38,18 @@ def test_states_take_their_place_whenever_they_arrive_and_the_first_of_two_stays
     np.testing.assert_array_equal(track.north_m, 2.0 * track.time_s)
 
 
+def test_arrays_lie_whole_in_memory_however_states_arrive() -> None:
+    buffer = northward(1)
+    for late_s, time_s in ((4.0, 5.0), (6.0, 7.0), (8.0, 9.0)):
+        assert buffer.track().time_s.flags.c_contiguous
+        buffer.add(time_s, 0.0, 0.0, 0.0)
+        assert buffer.track().time_s.flags.c_contiguous
+        buffer.add(late_s, 0.0, 0.0, 0.0)
+        assert buffer.track().time_s.flags.c_contiguous
+    buffer.forget_from(7.0)
+    assert buffer.track().time_s.flags.c_contiguous
+
+
 def test_a_state_is_held_against_those_before_and_after_it() -> None:
     buffer = northward(100)
     buffer.add(108.0, 216.0, 0.0, 0.0)

@@ -1,5 +1,7 @@
 """Windows of ranges with stretched and wild ones among them."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -92,6 +94,17 @@ def test_window_of_impossible_ranges_alone_is_not_certain() -> None:
         np.full(3, np.nan), np.full(3, 300.0), TIMES_S[:3], 3.0
     )
     assert not verdict.certain
+
+
+def test_longest_window_is_judged_even_if_nothing_explains_it() -> None:
+    """The product of so many densities stays within a double."""
+    longest = next(f for f in fields(RangeSettings) if f.name == "joined").metadata["maximum"]
+    judge, times_s = RangeJudge(RangeSettings(joined=longest)), np.linspace(0.0, 60.0, longest)
+    verdict = judge.judge(np.full(longest, 5000.0), np.full(longest, 300.0), times_s, 3.0)
+    assert not verdict.true.any()
+    assert not verdict.stretched.any()
+    true_m = 300.0 + 0.1 * times_s
+    assert judge.judge(true_m, true_m, times_s, 3.0).true.all()
 
 
 def test_lost_prediction_is_told_from_a_window_of_stretched_ranges() -> None:

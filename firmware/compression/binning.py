@@ -106,18 +106,18 @@ class SoundingBins:
         held = slot < self._settings.reservoir
         self._held[rows[held], slot[held]] = offset_m[held]
         self._filled[cells] = np.minimum(self._filled[cells] + counts, self._settings.reservoir)
-        near = held.copy()
-        if not held.all():
+        summed = ~held
+        if summed.any():
             if not np.isfinite(self._sigma_m):
                 self._sigma_m = self._noise_m()
-            late = np.flatnonzero(~held)
+            late = np.flatnonzero(summed)
             centre_m = _median(self._held[rows[late]], self._filled[rows[late]])
             gate_m = 2.0 * self._settings.flier_gate * self._sigma_m
-            near[late] = np.abs(offset_m[late] - centre_m) <= gate_m
-            self._late_fliers += int(np.count_nonzero(~near))
+            summed[late] = np.abs(offset_m[late] - centre_m) <= gate_m
+            self._late_fliers += late.size - int(np.count_nonzero(summed))
         values = (offset_m, offset_m**2, np.ones_like(offset_m), north_m, east_m, time_s)
         run = np.repeat(np.arange(cells.size), counts)
-        for these, lowest in ((near & ~held, 0), (held, 3)):  # depths of held ones come later
+        for these, lowest in ((summed, 0), (held, 3)):  # depths of held ones come later
             for column in range(lowest, 6):
                 self._sums[cells, column] += np.bincount(run, these * values[column])
 

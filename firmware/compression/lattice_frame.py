@@ -119,7 +119,7 @@ def interpolation(frame: LatticeFrame, position_m: Array) -> csr_array:
     columns = np.clip(whole[:, 1, None] + np.arange(-1, 3), 0, frame.columns - 1)
     index = rows[:, :, None] * frame.columns + columns[:, None, :]
     values = weights[0][:, :, None] * weights[1][:, None, :]
-    starts = 16 * np.arange(len(nodes) + 1, dtype=np.int32)  # half of what there is to read
+    starts = 16 * np.arange(len(nodes) + 1, dtype=np.int32)  # half as much to read
     shape = (len(nodes), frame.rows * frame.columns)
     return csr_array((values.ravel(), index.ravel().astype(np.int32), starts), shape=shape)
 

@@ -5,7 +5,7 @@ estimate at any time. The ledger belongs to the pose graph; which slots of ISAM2
 is the solver's.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import gtsam
@@ -147,10 +147,10 @@ class Solver:
             if entry.active and entry.slot is None:
                 added.push_back(self._factor(number))
                 numbers.append(number)
-                self._note_newest(entry.record)
             elif not entry.active and entry.slot is not None:
                 removed.append(entry.slot)
                 entry.slot = None
+        self._note_newest(self._ledger[number].record for number in numbers)
         result = self._isam.update(added, self._fresh, removed, self._last)
         for number, slot in zip(numbers, result.getNewFactorsIndices(), strict=True):
             self._ledger[number].slot = slot
@@ -158,16 +158,19 @@ class Solver:
             self._isam.update(constrainedKeys=self._last)  # a robust weight lags a step behind
         self._values = self._isam.calculateEstimate()
 
-    def _note_newest(self, record: Record) -> None:
-        """Let a vehicle's parameters, and the node at which its chain ends, be eliminated last.
+    def _note_newest(self, records: Iterable[Record]) -> None:
+        """Let a vehicle's parameters, and the node that it has reached, be eliminated last.
 
         What is told next hangs on these, and most questions are about them: either costs as much
-        as all that is eliminated after what it concerns.
+        as all that is eliminated after what it concerns. A ledger may tell of the way into the next
+        boot's chain before those within the last one's.
         """
-        if isinstance(record, OdometryRecord):
-            self._last.erase(record.origin)
-            for key in (record.target, record.parameters):
+        ways = [record for record in records if isinstance(record, OdometryRecord)]
+        for way in ways:
+            for key in (way.target, way.parameters):
                 self._last.insert2(key, 1)
+        for way in ways:
+            self._last.erase(way.origin)
 
     def _rebuild_by_qr(self, values: gtsam.Values) -> None:
         self._factorization = "QR"
@@ -178,7 +181,7 @@ class Solver:
         self._last = gtsam.KeyGroupMap()
         for entry in self._ledger.values():
             entry.slot = None
-            self._note_newest(entry.record)
+        self._note_newest(entry.record for entry in self._ledger.values())
         graph, entries = self._active_factors()
         self._begin()
         result = self._isam.update(graph, values, [], self._last)

@@ -269,6 +269,15 @@ def test_past_with_restarts_is_composed(boots: int) -> None:
     np.testing.assert_allclose(estimate.position_m, estimate.reckoned_m, atol=0.1)
 
 
+def test_only_where_vehicles_are_now_and_their_parameters_are_eliminated_last() -> None:
+    """However often they came back, and though a composed ledger tells of that first."""
+    _, graph = fleet_of(boots=6, end_s=3600)
+    graph.update()
+    assert graph._solver._last.size() == 4
+    graph.compose(3600.0, CompositionSettings())
+    assert graph._solver._last.size() == 4
+
+
 def test_dead_reckoning_alone_is_told_of_a_boot_after_hours_unheard() -> None:
     graph = PoseGraph(GraphSettings())
     time_s = np.arange(301.0)

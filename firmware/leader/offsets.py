@@ -72,10 +72,12 @@ class Offsets:
     """
 
     def __init__(self, estimate: Estimate, expected: Sequence[Sheet] = ()) -> None:
-        self._estimate, self._expected = estimate, expected
+        self._estimate = estimate
         self._sheets: dict[SheetId, Sheet] = {}
         self._anchors: dict[SheetId, Anchor] = {}  # of those that hang on a node
         self._joint: Array | None = None  # of the anchors, in their order
+        with contextlib.suppress(Exception):  # whoever asks for such a sheet meets it again
+            self._place(expected)
 
     def of(self, pairs: Sequence[tuple[Sheet, Sheet]]) -> list[Offset]:
         """Return the offset of the second sheet of each pair from the first.
@@ -83,7 +85,7 @@ class Offsets:
         Pairs with a sheet that hangs on no node are left out: frames were lost there. Raises
         EstimationError if the information matrix is singular.
         """
-        self._place(itertools.chain(self._expected, *pairs))
+        self._place(itertools.chain.from_iterable(pairs))
         placed = [pair for pair in pairs if all(sheet.id in self._anchors for sheet in pair)]
         if not placed:
             return []
@@ -115,9 +117,9 @@ class Offsets:
         """Find the anchors of sheets, and forget the joint covariance where some are new."""
         for sheet in sheets:
             if sheet.id not in self._sheets:
-                self._sheets[sheet.id], self._joint = sheet, None
                 with contextlib.suppress(EstimationError):
                     self._anchors[sheet.id] = anchor_of(sheet, self._estimate)
+                self._sheets[sheet.id], self._joint = sheet, None
 
 
 def anchor_of(sheet: Sheet, estimate: Estimate) -> Anchor:

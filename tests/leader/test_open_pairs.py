@@ -6,13 +6,15 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
-from firmware.leader import loop_closing, open_pairs
+from firmware.leader import loop_closing, offsets, open_pairs
 from firmware.leader.atlas import Atlas, Sheet, SheetId, sheet_of
 from firmware.leader.closure_settings import ClosureSettings
 from firmware.leader.closures import closure_of, enter_hint
 from firmware.leader.displacement import Look
+from firmware.leader.estimate import Estimate
 from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.judgement import Judgement, JudgementSettings
+from firmware.leader.ledger import Anchor
 from firmware.leader.loop_closing import LoopClosing
 from firmware.leader.match_jobs import MatchJob, jobs_again
 from firmware.leader.matches import ANY_PAIR, Hint, Match, MatchingSettings, MatchOutcome, NoMatch
@@ -239,12 +241,12 @@ def test_sheets_expected_to_be_asked_for_share_the_first_covariance(
     (alone,) = Offsets(graph).of([(first, second)])
     asked = MagicMock(side_effect=graph.state_covariance)
     monkeypatch.setattr(graph, "state_covariance", asked)
-    offsets = Offsets(graph, expected=[first, second])
-    offsets.of([(third, second)])
-    (offset,) = offsets.of([(first, second)])
+    shared = Offsets(graph, expected=[first, second])
+    shared.of([(third, second)])
+    (offset,) = shared.of([(first, second)])
     assert asked.call_count == 1
     assert offset.covariance_m2 == pytest.approx(alone.covariance_m2, rel=1e-9)
-    offsets.of([(_sheet(8, 70.0), second)])
+    shared.of([(_sheet(8, 70.0), second)])
     assert asked.call_count == 2
 
 
@@ -322,12 +324,21 @@ def test_a_second_look_that_raises_takes_nothing_else_along(
 def test_offsets_that_raise_leave_a_sheet_its_first_looks(
     atlas: Atlas, graph: PoseGraph, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first, second, third, _ = _sheets(atlas)
-    closing = LoopClosing(graph, atlas, LeaderSettings())
-    closing._open.note(_job(first, second, 1e6), AMBIGUOUS)
-    closing.add(third)
-    monkeypatch.setattr(Offsets, "of", MagicMock(side_effect=ValueError("no such row")))
-    assert closing.next_jobs() is not None
+    first, second, third, fourth = _sheets(atlas)
+    settings = ClosureSettings(expected_overlap_m2=0.0, screened_per_submap=2)
+    closing = LoopClosing(graph, atlas, LeaderSettings(closures=settings))
+    closing._open.note(_job(third, fourth, 1e6), AMBIGUOUS)
+    closing.add(_sheet(9, 100.0))
+
+    def anchor_of(sheet: Sheet, estimate: Estimate) -> Anchor:
+        if sheet is fourth:
+            raise ValueError("no such row")
+        return estimate.anchor(sheet.id.chain, sheet.time_s, sheet.track)
+
+    monkeypatch.setattr(offsets, "anchor_of", anchor_of)
+    batch = closing.next_jobs()
+    assert batch is not None
+    assert [job.origin for job in batch.jobs] == [first, second]
     assert closing.status()["second_looks_raised"] == 1
 
 

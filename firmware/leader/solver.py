@@ -26,7 +26,7 @@ from protocol.errors import EstimationError
 _RECKONING = (PriorRecord, OdometryRecord, SharedDriftRecord, SharedWalkRecord)
 _PLAIN = ("_ledger", "_robust_kernel", "_factorization", "rebuilds")
 _WORN = 1.3
-"""ISAM2 eliminates the newest variables last, and fills: so much of that, and it is built anew."""
+"""ISAM2 orders anew only what news reach, and fills: so much of that, and it is built anew."""
 
 _MOVED = 0.1
 """Metres, m/s or rad from which a variable is linearised anew.

@@ -36,7 +36,6 @@ class MatchingSettings(Settings):
     )
     search_sigmas: float = setting(3.0, "", "99 % of the prior's mass", minimum=1.0)
     search_cap_m: float = setting(200.0, "m", "beyond it sub-maps do not meet", minimum=1.0)
-    candidates: int = setting(200, "", "lattice shifts looked at more closely", minimum=1)
     basins: int = setting(4, "", "separate minima refined below the cell", minimum=1)
     absolute_depth: bool = setting(
         False, "", "the paper's: neither tide nor datum differs between passes"

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import ndimage
 
 from firmware.geometry import Array
 from firmware.leader import ambiguity
@@ -26,6 +27,7 @@ from firmware.submaps import GriddedSubmap
 from protocol.errors import EstimationError
 
 _FREE_M = 1e4  # of a one-axis closure across it: nothing, however often it is said
+_PEAK_CELLS = 5  # along each side of a square in which no second basin is looked for
 _NEGLIGIBLE = 1e-4  # mass beside the best lattice shift's that is not worth refining
 
 
@@ -159,7 +161,7 @@ def _refine_best(
     )
     inverse = np.linalg.inv(prior.covariance_m2)
     candidates = []
-    for start_m in _starts(surface, found, problem.settings, problem.query.grid.cell_m):
+    for start_m in _starts(surface, found.mass, problem.settings.basins):
         field = refine(problem.reference, problem.query, fields, start_m, problem.noise)
         if field is None:
             continue
@@ -179,25 +181,13 @@ def _refine_best(
     return candidates
 
 
-def _starts(
-    surface: ErrorSurface, found: ambiguity.Posterior, settings: MatchingSettings, cell_m: float
-) -> list[Array]:
-    """Return the best lattice shifts, no two of them neighbours."""
-    flat = found.mass.ravel()
-    count = min(settings.candidates, flat.size)
-    order = np.argpartition(flat, -count)[-count:]
-    order = order[np.argsort(flat[order])[::-1]]
-    starts: list[Array] = []
-    for index in order:
-        if flat[index] <= _NEGLIGIBLE * flat[order[0]]:
-            break
-        row, col = divmod(int(index), found.mass.shape[1])
-        shift = np.array([surface.north_m[row], surface.east_m[col]])
-        if all(np.hypot(*(shift - other)) > 2.9 * cell_m for other in starts):
-            starts.append(shift)
-        if len(starts) == settings.basins:
-            break
-    return starts
+def _starts(surface: ErrorSurface, mass: Array, most: int) -> Array:
+    """Return the lattice shifts (N, 2) where the posterior's mass (K, L) peaks, best first."""
+    peaks = (mass == ndimage.maximum_filter(mass, _PEAK_CELLS)) & (mass > _NEGLIGIBLE * mass.max())
+    found = np.flatnonzero(peaks)
+    best = found[np.argsort(-mass.flat[found], kind="stable")[:most]]
+    row, column = np.unravel_index(best, mass.shape)
+    return np.column_stack([surface.north_m[row], surface.east_m[column]])
 
 
 def _decide(

@@ -1,8 +1,10 @@
 """The incremental pose graph against a dense solution of the same records."""
 
 import dataclasses
+from typing import Any
 from unittest.mock import patch
 
+import gtsam
 import numpy as np
 import pytest
 
@@ -160,7 +162,19 @@ def test_factors_are_handed_the_very_point_about_which_the_solver_is_linearised(
     """Else gtsam's binding copies it, for each factor again."""
     graph = started(walk(np.random.default_rng(6), 100, 0.3)[0])
     graph.update()
-    assert graph._solver._isam.getLinearizationPoint() is graph._solver._about
+    solver, handed = graph._solver, list[gtsam.Values]()
+
+    def error(_this: object, values: gtsam.Values, jacobians: Any) -> np.ndarray:
+        handed.append(values)
+        jacobians[0] = np.eye(4)
+        return np.zeros(4)
+
+    key = next(key for key in solver._values.keys() if solver.state(key).size == 4)
+    factors = gtsam.NonlinearFactorGraph()
+    factors.push_back(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(4), [key], error))
+    solver._isam.update(factors, gtsam.Values())
+    assert handed
+    assert all(values is solver._about for values in handed)
 
 
 def test_gap_in_a_track_is_bridged_by_composed_positions() -> None:

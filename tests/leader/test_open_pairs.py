@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from firmware.leader import loop_closing, offsets, open_pairs
-from firmware.leader.atlas import Atlas, Sheet, SheetId, sheet_of
+from firmware.leader.atlas import Atlas, Sheet
 from firmware.leader.closure_settings import ClosureSettings
 from firmware.leader.closures import closure_of, enter_hint
 from firmware.leader.displacement import Look
 from firmware.leader.estimate import Estimate
-from firmware.leader.graph_settings import GraphSettings
 from firmware.leader.judgement import Judgement, JudgementSettings
 from firmware.leader.ledger import Anchor
 from firmware.leader.loop_closing import LoopClosing
@@ -23,7 +22,7 @@ from firmware.leader.open_pairs import OpenPairs
 from firmware.leader.pairing import Calibrations
 from firmware.leader.pose_graph import PoseGraph
 from firmware.leader.settings import LeaderSettings
-from firmware.submaps import GriddedSubmap, Track
+from tests.leader.sheets import northward, sheet_at, two_sheets
 
 AMBIGUOUS = MatchOutcome(match=None, reason=NoMatch.AMBIGUOUS)
 UNSETTLED = MatchOutcome(match=None, reason=NoMatch.UNSETTLED)
@@ -36,23 +35,6 @@ LOOK = Look(
     errors=np.zeros(2),
     covariance=np.zeros((2, 2)),
 )
-
-
-def _sheet(submap: int, time_s: float = 0.0) -> Sheet:
-    shape = (4, 4)
-    grid = GriddedSubmap(
-        north0_m=0.0,
-        east0_m=0.0,
-        cell_m=2.0,
-        depth_m=np.ones(shape),
-        variance_m2=np.full(shape, 0.01),
-        time_s=np.full(shape, time_s),
-    )
-    times_s = time_s + np.arange(3.0)
-    track = Track(time_s=times_s, north_m=times_s, east_m=np.zeros(3), yaw_rad=np.zeros(3))
-    sheet = sheet_of(SheetId(vehicle=0, boot_epoch=0, submap=submap), track, grid)
-    assert sheet is not None
-    return sheet
 
 
 def _job(origin: Sheet, target: Sheet, radius_m: float) -> MatchJob:
@@ -72,17 +54,22 @@ def _job(origin: Sheet, target: Sheet, radius_m: float) -> MatchJob:
 
 
 @pytest.fixture
+def graph() -> PoseGraph:
+    return northward()
+
+
+@pytest.fixture
 def atlas() -> Atlas:
     atlas = Atlas(8)
     for submap in range(4):
-        atlas.add(_sheet(submap))
+        atlas.add(sheet_at(submap))
     return atlas
 
 
 def _assert_turn(
     pairs: OpenPairs, atlas: Atlas, graph: PoseGraph, target: Sheet, origin: Sheet, radius_m: float
 ) -> None:
-    ((looked_at, partners),) = pairs.turns(_sheet(9), atlas, graph)
+    ((looked_at, partners),) = pairs.turns(sheet_at(9), atlas, graph)
     assert looked_at is target
     ((partner, pair),) = partners
     assert (partner, pair.hint) == (origin, None)
@@ -117,7 +104,7 @@ def test_settled_and_impossible_pairs_are_forgotten(atlas: Atlas, graph: PoseGra
     pairs.settle(first.id, third.id)
     _assert_turn(pairs, atlas, graph, third, second, 16.0)
     pairs.note(_job(second, third, 3.0), UNSETTLED)
-    assert pairs.turns(_sheet(9), atlas, graph) == []
+    assert pairs.turns(sheet_at(9), atlas, graph) == []
     assert len(pairs) == 0
 
 
@@ -129,8 +116,8 @@ def test_sheets_take_turns_and_shelved_ones_are_left_out(atlas: Atlas, graph: Po
     atlas.shelve(third.id)
     turns = []
     for _ in range(3):
-        turns += [target for target, _ in pairs.turns(_sheet(9), atlas, graph)]
-        _second_looks(pairs, _sheet(9), atlas, graph)
+        turns += [target for target, _ in pairs.turns(sheet_at(9), atlas, graph)]
+        _second_looks(pairs, sheet_at(9), atlas, graph)
     assert turns == [second, fourth, second]
 
 
@@ -150,20 +137,11 @@ def test_pair_whose_hint_was_composed_away_is_passed_over(atlas: Atlas, graph: P
     pairs.note_hint(first.id, second.id, 10_000)
     assert pairs.hint(first.id, second.id) == 10_000
     assert 10_000 not in graph
-    assert pairs.turns(_sheet(9), atlas, graph) == []
-
-
-def _two_sheets() -> tuple[Sheet, Sheet]:
-    """Return two sheets, 80 s apart, whose middles lie between the nodes of the graph."""
-    first, second = (
-        dataclasses.replace(_sheet(k, time_s), track=_long_track())
-        for k, time_s in ((1, 22.0), (2, 102.0))
-    )
-    return first, second
+    assert pairs.turns(sheet_at(9), atlas, graph) == []
 
 
 def _looks(graph: PoseGraph, then_m: float, hint: int | None = None) -> list[MatchJob]:
-    origin, target = _two_sheets()
+    origin, target = two_sheets()
     calibrations = Calibrations(MatchingSettings())
     (offset,) = Offsets(graph).of([(origin, target)])
     return jobs_again(target, [(offset, then_m, hint)], graph, ClosureSettings(), calibrations)
@@ -199,65 +177,6 @@ def test_what_the_pair_itself_has_told_does_not_make_it_better_known(graph: Pose
     )
     assert after.prior_shift_m == pytest.approx(before.prior_shift_m, abs=5e-2)
     assert _looks(graph, before.prior_radius_m, hint) == []
-
-
-def test_what_is_taken_out_of_an_offset_leaves_the_composed_past_as_unsure_as_it_was(
-    graph: PoseGraph,
-) -> None:
-    (offset,) = Offsets(graph).of([_two_sheets()])
-    apart_m2, told_m2 = np.diag([30.0, 50.0]), np.array([[20.0, 5.0], [5.0, 40.0]])
-    open_m2, told_m = offset.covariance_m2, np.array([7.0, -4.0])
-    both_m2 = np.linalg.inv(np.linalg.inv(open_m2) + np.linalg.inv(told_m2))
-    met_m = both_m2 @ (np.linalg.solve(open_m2, offset.shift_m) + np.linalg.solve(told_m2, told_m))
-    told = dataclasses.replace(
-        offset, shift_m=met_m, covariance_m2=both_m2 + apart_m2, apart_m2=apart_m2
-    )
-    left = told.without(told_m, told_m2)
-    assert left.shift_m == pytest.approx(offset.shift_m, abs=1e-6)
-    assert left.covariance_m2 == pytest.approx(open_m2 + apart_m2)
-    assert left.open_sigma_m == pytest.approx(offset.sigma_m)
-
-
-def test_pairs_with_a_sheet_on_no_node_are_left_out_and_ways_to_nodes_add_up(
-    graph: PoseGraph,
-) -> None:
-    first, second = _two_sheets()
-    lost = dataclasses.replace(first, id=dataclasses.replace(first.id, vehicle=1))
-    assert Offsets(graph).of([(lost, second)]) == []
-    graph.lose(0, 19.0, 23.0)
-    graph.lose(0, 101.0, 107.0)
-    (offset,) = Offsets(graph).of([(first, lost), (first, second)])
-    assert (offset.origin, offset.target) == (first, second)
-    ways_m2 = [graph.anchor(0, sheet.time_s, sheet.track).apart_m2 for sheet in (first, second)]
-    assert ways_m2[0][0, 0] > ways_m2[1][0, 0] > 0.0
-    assert offset.apart_m2 == pytest.approx(ways_m2[0] + ways_m2[1])
-
-
-def test_sheets_expected_to_be_asked_for_share_the_first_covariance(
-    graph: PoseGraph, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    first, second = _two_sheets()
-    third = dataclasses.replace(first, id=dataclasses.replace(first.id, submap=7), time_s=50.0)
-    (alone,) = Offsets(graph).of([(first, second)])
-    asked = MagicMock(side_effect=graph.state_covariance)
-    monkeypatch.setattr(graph, "state_covariance", asked)
-    shared = Offsets(graph, expected=[first, second])
-    shared.of([(third, second)])
-    (offset,) = shared.of([(first, second)])
-    assert asked.call_count == 1
-    assert offset.covariance_m2 == pytest.approx(alone.covariance_m2, rel=1e-9)
-    shared.of([(_sheet(8, 70.0), second)])
-    assert asked.call_count == 2
-
-
-def test_offset_tells_drift_as_the_time_between_the_sheets_says(graph: PoseGraph) -> None:
-    origin, target = _two_sheets()
-    (offset,) = Offsets(graph).of([(origin, target)])
-    apart_s, known_m2 = target.time_s - origin.time_s, offset.covariance_m2
-    assert offset.drifts.gain == pytest.approx(np.tile(-np.eye(2) / apart_s, (2, 1)), rel=0.1)
-    drifts = offset.drifts.covariance(known_m2)
-    assert np.diag(drifts) == pytest.approx(np.full(4, 0.2**2), rel=0.1)
-    assert np.trace(offset.drifts.left) < 0.1 * np.trace(drifts)
 
 
 def test_closure_is_told_where_the_sonar_really_looked(graph: PoseGraph) -> None:
@@ -328,7 +247,7 @@ def test_offsets_that_raise_leave_a_sheet_its_first_looks(
     settings = ClosureSettings(expected_overlap_m2=0.0, screened_per_submap=2)
     closing = LoopClosing(graph, atlas, LeaderSettings(closures=settings))
     closing._open.note(_job(third, fourth, 1e6), AMBIGUOUS)
-    closing.add(_sheet(9, 100.0))
+    closing.add(sheet_at(9, 100.0))
 
     def anchor_of(sheet: Sheet, estimate: Estimate) -> Anchor:
         if sheet is fourth:
@@ -396,17 +315,3 @@ def test_match_takes_the_place_of_the_hint(graph: PoseGraph) -> None:
     assert not graph.is_active(number)
     assert len(pairs) == 0
     assert not pairs._heard  # once the graph has let it go it would be taken for composed
-
-
-@pytest.fixture
-def graph() -> PoseGraph:
-    graph = PoseGraph(GraphSettings())
-    graph.add_chain(0, 0.0, np.zeros(2), np.zeros(2))
-    graph.extend(0, _long_track())
-    graph.update()
-    return graph
-
-
-def _long_track() -> Track:
-    times_s = np.arange(201.0)
-    return Track(time_s=times_s, north_m=times_s, east_m=0 * times_s, yaw_rad=0 * times_s)

@@ -15,7 +15,37 @@ from firmware.geometry import Array
 from firmware.leader.screening import Landing, Layer, land, sample
 
 _DEPTH, _VARIANCE, _TIME, _SLOPES = 0, 1, 2, slice(3, 5)  # of the fields
+_TINY_M2 = 1e-6  # two sub-maps of one node have no offset
 _LEAST_CELLS = 12  # fewer cells than unknowns determine nothing
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Belief:
+    """What is believed of a pair before its match: the shift, and how it goes with the drifts.
+
+    covariance (6, 6) is that of the shift between times_s of both, of the drift of the reference
+    and of that of the query, in m and m/s. mean_m (2,) is the shift's; of the grids the mean drift
+    was taken.
+    """
+
+    mean_m: Array
+    covariance: Array
+    times_s: tuple[float, float]
+
+    def drifts_at(self, times_s: tuple[float, float]) -> tuple[Array, Array]:
+        """Return the gain (4, 2) of both drifts by the shift between other times, and the rest.
+
+        The latter is their covariance (4, 4) where that shift is known.
+        """
+        moved = np.eye(6)
+        moved[:2, 2:4] = (times_s[0] - self.times_s[0]) * np.eye(2)
+        moved[:2, 4:] = (self.times_s[1] - times_s[1]) * np.eye(2)
+        both = moved @ self.covariance @ moved.T
+        gain = np.linalg.solve(both[:2, :2] + _TINY_M2 * np.eye(2), both[:2, 2:]).T
+        return gain, both[2:, 2:] - gain @ both[:2, 2:]
+
+
+KNOWN_DRIFT = Belief(mean_m=np.zeros(2), covariance=np.zeros((6, 6)), times_s=(0.0, 0.0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,6 +53,7 @@ class NoiseModel:
     """Standard deviations that the fit assumes; all may be zero but cell_sigma_m.
 
     correlated_share is the share of a cell's variance that is alike within correlation_m.
+    drift_sigma_mps is that of drifts beside what is believed of them.
     """
 
     cell_sigma_m: float
@@ -34,6 +65,7 @@ class NoiseModel:
     walk_m2_per_s: float
     correlation_m: float
     correlated_share: float
+    belief: Belief = KNOWN_DRIFT
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -144,22 +176,3 @@ def _span(time_s: Array) -> Span:
 def _polynomials(n: Array, e: Array) -> Array:
     """Return 1, n, e, n^2, n e, e^2, of metres from the middle; (6, N)."""
     return np.stack([np.ones(n.size), n, e, n * n, n * e, e * e])
-
-
-def design_of(field: Aligned, noise: NoiseModel) -> tuple[Array, Array]:
-    """Return the design (p, N) and the prior information (p,) of its unknowns.
-
-    The unknowns are the shift, which has no prior, then those of offset, drift of reference and
-    query, tilt and bend whose sigma is not zero, in this order.
-    """
-    slope = 0.5 * (field.slope_r + field.slope_q)
-    groups = [
-        (field.basis[:1], noise.offset_sigma_m),
-        (-slope * field.spans[0].age_s, noise.drift_sigma_mps),
-        (slope * field.spans[1].age_s, noise.drift_sigma_mps),
-        (field.basis[1:3], noise.tilt_sigma),
-        (field.basis[3:], noise.bend_sigma_per_m),
-    ]
-    active = [(columns, sigma) for columns, sigma in groups if sigma > 0.0]
-    prior = [0.0, 0.0] + [1.0 / sigma**2 for columns, sigma in active for _ in columns]
-    return np.concatenate([slope, *(columns for columns, _ in active)]), np.array(prior)

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from firmware.geometry import Array
-from firmware.leader.alignment import Aligned, NoiseModel, design_of
-from firmware.leader.refinement import solve
+from firmware.leader.alignment import Aligned, NoiseModel
+from firmware.leader.design import Design, design_of, solve
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,13 +33,13 @@ class Refined:
 
 def measure(field: Aligned, noise: NoiseModel) -> Refined:
     """Return the fit at its optimum with the sandwich covariance."""
-    design, prior = design_of(field, noise)
-    residual = field.difference_m - solve(field, design, prior) @ design
+    design = design_of(field, noise)
+    residual = field.difference_m - solve(field, design) @ design.columns
     misfit = float(np.mean(residual**2 / field.variance_m2))
     walk_s = sum(span.length_s / 12.0 for span in field.spans)
     return Refined(
         shift_m=field.shift_m,
-        covariance_m2=_sandwich(field, design, prior, residual, max(misfit, 1.0), noise),
+        covariance_m2=_sandwich(field, design, residual, max(misfit, 1.0), noise),
         walk_m2=noise.walk_m2_per_s * walk_s,
         variance_m2=float(field.variance_m2.mean()),
         overlap_cells=field.cells,
@@ -50,7 +50,7 @@ def measure(field: Aligned, noise: NoiseModel) -> Refined:
 
 
 def _sandwich(
-    field: Aligned, design: Array, prior: Array, residual: Array, misfit: float, noise: NoiseModel
+    field: Aligned, design: Design, residual: Array, misfit: float, noise: NoiseModel
 ) -> Array:
     """Return H^-1 (B + P) H^-1 of the shift, (2, 2).
 
@@ -59,8 +59,8 @@ def _sandwich(
     the score under residuals correlated as they are seen to be, and at least as the model says; of
     H^-1 the shift's rows are enough to lay about it.
     """
-    p, weight = len(prior), 1.0 / field.variance_m2
-    curvature = (design * weight) @ design.T
+    p, weight = len(design.columns), 1.0 / field.variance_m2
+    curvature = (design.columns * weight) @ design.columns.T
     cross = (field.slope_r * weight) @ field.slope_q.T
     raw = curvature[:2, :2].copy()
     curvature[:2, :2] = 0.5 * (cross + cross.T)
@@ -69,11 +69,11 @@ def _sandwich(
     rotated = np.eye(p)
     rotated[:2, :2] = vectors.T
     kept = rotated[np.concatenate([usable, np.ones(p - 2, dtype=bool)])]
-    inverse = np.linalg.inv(kept @ (curvature + np.diag(prior)) @ kept.T)
+    inverse = np.linalg.inv(kept @ (curvature + design.information) @ kept.T)
     gain = inverse[: usable.sum()] @ kept
-    scores_m2 = _score_covariance(field, gain @ design, residual, misfit, noise)
+    scores_m2 = _score_covariance(field, gain @ design.columns, residual, misfit, noise)
     spread = 1e6 * np.eye(2)  # a kilometre: nothing is known in that direction
-    spread[np.ix_(usable, usable)] = scores_m2 + (gain * prior) @ gain.T
+    spread[np.ix_(usable, usable)] = scores_m2 + gain @ design.information @ gain.T
     result = vectors @ spread @ vectors.T
     return np.asarray(0.5 * (result + result.T))
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware.geometry import Array
+from firmware.leader.alignment import Belief
 from firmware.leader.ambiguity import Prior
 from firmware.leader.pair_problem import PairProblem
 from firmware.leader.screening import ErrorSurface
@@ -43,6 +44,22 @@ class Drifts:
     def covariance(self, offset_m2: Array) -> Array:
         """Return their covariance (4, 4) in (m/s)^2 where the offset is known to (2, 2)."""
         return np.asarray(self.left + self.gain @ offset_m2 @ self.gain.T)
+
+    def belief(
+        self, prior: Prior, reference: GriddedSubmap, query: GriddedSubmap
+    ) -> Belief:
+        """Return how the shift of two grids, of which the expected drift was taken, goes with both.
+
+        The prior is that of the shift between the middles of their times.
+        """
+        told = self.gain @ prior.covariance_m2
+        return Belief(
+            mean_m=prior.mean_m,
+            covariance=np.block(
+                [[prior.covariance_m2, told.T], [told, self.covariance(prior.covariance_m2)]]
+            ),
+            times_s=(_middle_s(reference), _middle_s(query)),
+        )
 
     def unresolved_m(self, offset_m2: Array) -> float:
         """Return how far cells may still lie apart when every shift has the nearest drift."""
@@ -121,8 +138,13 @@ def _nearest(away_m: Array, steps_m: Array) -> Array:
 
 def _without(grid: GriddedSubmap, drift_mps: Array) -> GriddedSubmap:
     """Return a grid warped anew. Its cells are not averaged: else any other drift fitted better."""
-    middle_s = float(np.nanmedian(grid.time_s))
-    return remove_drift(grid, float(drift_mps[0]), float(drift_mps[1]), middle_s, nearest=True)
+    return remove_drift(
+        grid, float(drift_mps[0]), float(drift_mps[1]), _middle_s(grid), nearest=True
+    )
+
+
+def _middle_s(grid: GriddedSubmap) -> float:
+    return float(np.nanmedian(grid.time_s))
 
 
 def _fields(surface: ErrorSurface) -> Array:

@@ -273,5 +273,4 @@ def _strained(sigmas: PairSigmas, origin: Side, target: Side, offset: Offset) ->
     expected_m = strain_m(origin, target, drift_m2ps2)
     left_m = strain_m(origin, target, offset.drifts.left)
     strained_m = min(float(np.hypot(left_m, offset.drifts.unresolved_m(known_m2))), expected_m)
-    worst_mps = np.sqrt(max(np.trace(drift_m2ps2[:2, :2]), np.trace(drift_m2ps2[2:, 2:])) / 2.0)
-    return dataclasses.replace(sigmas, strain_m=strained_m, drift_mps=float(worst_mps))
+    return dataclasses.replace(sigmas, strain_m=strained_m)

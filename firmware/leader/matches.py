@@ -102,7 +102,6 @@ class PairSigmas:
     tilt: float = 0.004  # m/m; roll bias of 0.2 degree seen from both sides
     bend_per_m: float = 4e-5  # a smile of 0.15 m at the edge of a 60 m swath
     strain_m: float = 0.0  # between cells of both, by drift within them that is not known yet
-    drift_mps: float = 0.0  # of either, beside that of the settings
 
 
 ANY_PAIR = PairSigmas()  # of vehicles that nothing is known of

@@ -58,8 +58,8 @@ def match(
     E of Eq. (8) (Eq. (10) when a side is reconstructed) is screened at every lattice shift of the
     window that the prior implies, the best minima are refined below the cell, and the winner has
     to pass the threshold, carry evidence against unrelated seabed and leave little posterior mass
-    elsewhere. A pair that fails leaves a hint, if one is asked for; then every shift is judged with
-    the drifts that it implies. The prior is that of the shift: mean (2,) and covariance (2, 2).
+    elsewhere. The fit holds every shift with the drifts that it implies. A pair that fails leaves a
+    hint, if one is asked for; then the screening does so, too. The prior is that of the shift: mean (2,) and covariance (2, 2).
 
     Raises
     ------
@@ -70,6 +70,7 @@ def match(
     if problem is None:
         return _none(NoMatch.EMPTY)
     prior = Prior(np.asarray(prior_shift_m), _checked(prior_covariance_m2))
+    problem = problem.believing(drifts.belief(prior, reference, query))
     whole = problem.surface()
     surface = _window(whole, prior, problem)
     if surface is None or not np.isfinite(surface.residual_m2).any():

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware.geometry import Array
-from firmware.leader.alignment import NoiseModel
+from firmware.leader.alignment import Belief, NoiseModel
 from firmware.leader.ambiguity import Relief, background
 from firmware.leader.matches import ANY_PAIR, MatchingSettings, PairSigmas
 from firmware.leader.relief import (
@@ -51,6 +51,10 @@ class PairProblem:
     shared_m2: float
     slope2: float
     charges_m2: tuple[tuple[float, float], ...]  # of each layer; see Layer.charged
+
+    def believing(self, belief: Belief) -> "PairProblem":
+        """Return the problem where so much is believed of shift and drifts."""
+        return dataclasses.replace(self, noise=dataclasses.replace(self.noise, belief=belief))
 
     def surface(self) -> ErrorSurface:
         """Return E at every lattice shift."""
@@ -188,7 +192,7 @@ def noise_model(
         offset_sigma_m=0.0 if settings.absolute_depth else sigmas.offset_m,
         tilt_sigma=sigmas.tilt,
         bend_sigma_per_m=sigmas.bend_per_m,
-        drift_sigma_mps=float(np.hypot(settings.drift_sigma_mps, sigmas.drift_mps)),
+        drift_sigma_mps=settings.drift_sigma_mps,
         walk_m2_per_s=settings.walk_m2_per_s,
         correlation_m=settings.correlation_m,
         correlated_share=correlated_share,

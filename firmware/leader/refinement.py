@@ -3,7 +3,8 @@
 import numpy as np
 
 from firmware.geometry import Array
-from firmware.leader.alignment import Aligned, NoiseModel, align, design_of
+from firmware.leader.alignment import Aligned, NoiseModel, align
+from firmware.leader.design import design_of, solve
 from firmware.leader.screening import Layer
 
 _ITERATIONS = 8  # from the lattice's best cell it settles in four to six
@@ -30,7 +31,7 @@ def refine(
         field = align(reference, query, fields, shift, noise)
         if field is None:
             return None
-        unknowns = solve(field, *design_of(field, noise))
+        unknowns = solve(field, design_of(field, noise))
         step = -unknowns[:2]
         length = float(np.hypot(*step))
         if not np.isfinite(length):
@@ -54,11 +55,3 @@ def _accelerated(step: Array, last: Array, moved: Array) -> Array:
 def limited(move_m: Array) -> Array:
     """Return a move (2,) no longer than gradients are believed."""
     return np.asarray(move_m * min(1.0, _LONGEST_STEP_M / max(float(np.hypot(*move_m)), 1e-12)))
-
-
-def solve(field: Aligned, design: Array, prior: Array) -> Array:
-    """Return the unknowns (p,) that explain the difference."""
-    weighted = design / field.variance_m2
-    information = weighted @ design.T + np.diag(prior)
-    information[:2, :2] += np.eye(2) * 1e-9
-    return np.asarray(np.linalg.solve(information, weighted @ field.difference_m))

@@ -1,0 +1,68 @@
+"""What may explain how two aligned sub-maps differ, and the fit of it by weighted least squares."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from firmware.geometry import Array
+from firmware.leader.alignment import Aligned, NoiseModel
+
+_UNKNOWN_MPS = 1e-4  # least sigma of a drift: two millimetres at the ends of a sub-map
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Design:
+    """Columns (p, N) by unknown, and their Gaussian prior: information (p, p) and its vector (p,).
+
+    The unknowns are how far the shift (2,) is too large, the drift (2,) of the reference and of the
+    query, and those of depth offset, tilt and bend whose sigma is not zero, in this order.
+    """
+
+    columns: Array
+    information: Array
+    vector: Array
+
+
+def design_of(field: Aligned, noise: NoiseModel) -> Design:
+    """Return the design of an overlap.
+
+    The shift has no prior of its own: only what it implies of the drifts speaks of it.
+    """
+    nuisances = [
+        (field.basis[:1], noise.offset_sigma_m),
+        (field.basis[1:3], noise.tilt_sigma),
+        (field.basis[3:], noise.bend_sigma_per_m),
+    ]
+    active = [(columns, sigma) for columns, sigma in nuisances if sigma > 0.0]
+    slope, ages_s = 0.5 * (field.slope_r + field.slope_q), [s.age_s for s in field.spans]
+    moved = [slope, -slope * ages_s[0], slope * ages_s[1]]
+    drift_information, drift_vector = _of_drifts(field, noise)
+    own = [1.0 / sigma**2 for columns, sigma in active for _ in columns]
+    information = np.diag(np.concatenate([np.zeros(6), own]))
+    information[:6, :6] = drift_information
+    return Design(
+        columns=np.concatenate([*moved, *(columns for columns, _ in active)]),
+        information=information,
+        vector=np.concatenate([drift_vector, np.zeros(len(own))]),
+    )
+
+
+def _of_drifts(field: Aligned, noise: NoiseModel) -> tuple[Array, Array]:
+    """Return information (6, 6) and vector (6,) that both drifts are those that the shift implies.
+
+    A shift too large by u implies the drifts gain (shift - u - mean).
+    """
+    belief, (first, second) = noise.belief, field.spans
+    gain, left = belief.drifts_at((first.mean_s, second.mean_s))
+    alone = max(noise.drift_sigma_mps, _UNKNOWN_MPS)
+    implied = np.hstack([gain, np.eye(4)])
+    weighted = implied.T @ np.linalg.inv(left + alone**2 * np.eye(4))
+    return weighted @ implied, weighted @ gain @ (field.shift_m - belief.mean_m)
+
+
+def solve(field: Aligned, design: Design) -> Array:
+    """Return the unknowns (p,) that explain the difference."""
+    weighted = design.columns / field.variance_m2
+    information = weighted @ design.columns.T + design.information
+    information[:2, :2] += np.eye(2) * 1e-9
+    return np.asarray(np.linalg.solve(information, weighted @ field.difference_m + design.vector))

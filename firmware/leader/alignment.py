@@ -14,8 +14,9 @@ from scipy import ndimage
 from firmware.geometry import Array
 from firmware.leader.screening import Landing, Layer, land, sample
 
-_DEPTH, _VARIANCE, _TIME, _SLOPES = 0, 1, 2, slice(3, 5)  # of the fields
+_DEPTH, _VARIANCE, _TIME, _SLOPES, _SMOOTH = 0, 1, 2, slice(3, 5), slice(5, 7)  # of the fields
 _TINY_M2 = 1e-6  # two sub-maps of one node have no offset
+_LEAST_SHARE = 0.1  # of a smoothing that lies on known cells
 _LEAST_CELLS = 12  # fewer cells than unknowns determine nothing
 
 
@@ -97,6 +98,8 @@ class Aligned:
     variance_m2: Array
     slope_r: Array  # (2, N)
     slope_q: Array  # (2, N)
+    smooth_r: Array  # (2, N) the same without most of the noise, and of the finest relief
+    smooth_q: Array  # (2, N)
     spans: tuple[Span, Span]  # of reference and query
     basis: Array  # (6, N) offset, tilt, bend
 
@@ -112,20 +115,22 @@ class Aligned:
 
 
 def fields_of(layer: Layer, smoothing_cells: float) -> Array:
-    """Return depth, variance, time and smoothed slopes to north and east, (5, R, C).
+    """Return depth, variance, time, and slopes to north and east as they are and smooth, (7, R, C).
 
-    Slopes are smoothed over the known cells to keep sounding noise out; all fields are NaN where
+    Smoothing over the known cells keeps sounding noise out of the slopes; all fields are NaN where
     one of them is unknown. A grid of one row or column has no slopes: nothing of it is known.
     """
-    depth = np.where(layer.known > 0, layer.grid.depth_m - np.nanmean(layer.grid.depth_m), 0.0)
+    depth_m, cell_m, is_known = layer.grid.depth_m, layer.grid.cell_m, layer.known > 0
+    if min(depth_m.shape) < 2:
+        return np.full((7, *depth_m.shape), np.nan)
+    depth = np.where(is_known, depth_m - np.nanmean(depth_m), 0.0)
     share = ndimage.gaussian_filter(layer.known, smoothing_cells, mode="constant")
     smooth = ndimage.gaussian_filter(depth, smoothing_cells, mode="constant")
-    smooth = np.where(share > 0.3, smooth / np.maximum(share, 0.3), np.nan)
-    if min(smooth.shape) < 2:
-        return np.full((5, *smooth.shape), np.nan)
-    slopes = np.gradient(smooth, layer.grid.cell_m)
-    stack = np.stack([layer.grid.depth_m, layer.map_m2, layer.grid.time_s, *slopes])
-    return np.where(np.isfinite(stack).all(axis=0), stack, np.nan)
+    smooth = smooth / np.maximum(share, _LEAST_SHARE)
+    slopes = np.gradient(np.where(is_known, depth, smooth), cell_m)  # at edges half of it is smooth
+    stack = [depth_m, layer.map_m2, layer.grid.time_s, *slopes, *np.gradient(smooth, cell_m)]
+    fields = np.stack(stack)
+    return np.where(np.isfinite(fields).all(axis=0), fields, np.nan)
 
 
 def align(
@@ -146,9 +151,9 @@ def align(
         return None
     under, over = (side.reshape(len(side), -1).take(found, axis=1) for side in (under, over))
     row, column = np.divmod(found, both.shape[1])
-    slope_r, slope_q = under[_SLOPES], over[_SLOPES]
+    smooth_r, smooth_q = under[_SMOOTH], over[_SMOOTH]
     variance = under[_VARIANCE] + over[_VARIANCE] + noise.cell_sigma_m**2
-    variance += 0.25 * noise.position_sigma_m**2 * np.sum((slope_r + slope_q) ** 2, axis=0)
+    variance += 0.25 * noise.position_sigma_m**2 * np.sum((smooth_r + smooth_q) ** 2, axis=0)
     cell_m, middle = query.grid.cell_m, np.array([row.mean(), column.mean()])
     first_m = np.array([query.grid.north0_m, query.grid.east0_m])
     corner = np.array([at.query[0].start, at.query[1].start])
@@ -160,8 +165,10 @@ def align(
         both=both,
         difference_m=under[_DEPTH] - over[_DEPTH],
         variance_m2=variance,
-        slope_r=slope_r,
-        slope_q=slope_q,
+        slope_r=under[_SLOPES],
+        slope_q=over[_SLOPES],
+        smooth_r=smooth_r,
+        smooth_q=smooth_q,
         basis=_polynomials(cell_m * (row - middle[0]), cell_m * (column - middle[1])),
         spans=(_span(under[_TIME]), _span(over[_TIME])),
     )

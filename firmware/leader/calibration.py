@@ -178,7 +178,7 @@ class _System:
 
 
 def _system(field: Aligned, swath: Array, settings: CalibrationSettings) -> _System:
-    slope = 0.5 * (field.slope_r + field.slope_q)
+    slope = 0.5 * (field.smooth_r + field.smooth_q)
     design = np.concatenate([slope, field.basis[:1], swath])
     weight = 1.0 / (field.variance_m2 * settings.redundancy)
     normal = (design * weight) @ design.T

@@ -8,7 +8,10 @@ from scipy import fft
 
 from firmware.geometry import Array
 from firmware.leader.alignment import Aligned, NoiseModel
-from firmware.leader.design import Design, design_of, solve
+from firmware.leader.design import Design, curvature, design_of, solve
+
+
+_TOLD_BY_BOTH = 0.25  # of slopes, without which the grids do not show the same relief
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,22 +57,19 @@ def _sandwich(
 ) -> Array:
     """Return H^-1 (B + P) H^-1 of the shift, (2, 2).
 
-    H is the curvature; its shift block multiplies the slopes of one grid with those of the other,
-    whose noises are independent, so that noise alone makes no information. B is the covariance of
-    the score under residuals correlated as they are seen to be, and at least as the model says; of
-    H^-1 the shift's rows are enough to lay about it.
+    H is the curvature, in which noise alone makes no information. B is the covariance of the score
+    under residuals correlated as they are seen to be, and at least as the model says; of H^-1 the
+    shift's rows are enough to lay about it.
     """
-    p, weight = len(design.columns), 1.0 / field.variance_m2
-    curvature = (design.columns * weight) @ design.columns.T
-    cross = (field.slope_r * weight) @ field.slope_q.T
-    raw = curvature[:2, :2].copy()
-    curvature[:2, :2] = 0.5 * (cross + cross.T)
-    values, vectors = np.linalg.eigh(curvature[:2, :2])
-    usable = values > 0.25 * np.einsum("ia,ij,ja->a", vectors, raw, vectors)
+    p, found = len(design.columns), curvature(field, design)
+    slopes = design.columns[:2]
+    values, vectors = np.linalg.eigh(found[:2, :2])
+    steep = np.sum((vectors.T @ slopes) ** 2 / field.variance_m2, axis=1)
+    usable = values > _TOLD_BY_BOTH * steep
     rotated = np.eye(p)
     rotated[:2, :2] = vectors.T
     kept = rotated[np.concatenate([usable, np.ones(p - 2, dtype=bool)])]
-    inverse = np.linalg.inv(kept @ (curvature + design.information) @ kept.T)
+    inverse = np.linalg.inv(kept @ (found + design.information) @ kept.T)
     gain = inverse[: usable.sum()] @ kept
     scores_m2 = _score_covariance(field, gain @ design.columns, residual, misfit, noise)
     spread = 1e6 * np.eye(2)  # a kilometre: nothing is known in that direction

@@ -14,7 +14,8 @@ _UNKNOWN_MPS = 1e-4  # least sigma of a drift: two millimetres at the ends of a 
 class Design:
     """Columns (p, N) by unknown, and their Gaussian prior: information (p, p) and its vector (p,).
 
-    The unknowns are how far the shift (2,) is too large, the drift (2,) of the reference and of the
+    The columns are made of smooth slopes, and weigh the differences; what a change of the unknowns
+    does to these is told by `curvature`. The unknowns are how far the shift (2,) is too large, the drift (2,) of the reference and of the
     query, and those of depth offset, tilt and bend whose sigma is not zero, in this order.
     """
 
@@ -34,17 +35,41 @@ def design_of(field: Aligned, noise: NoiseModel) -> Design:
         (field.basis[3:], noise.bend_sigma_per_m),
     ]
     active = [(columns, sigma) for columns, sigma in nuisances if sigma > 0.0]
-    slope, ages_s = 0.5 * (field.slope_r + field.slope_q), [s.age_s for s in field.spans]
-    moved = [slope, -slope * ages_s[0], slope * ages_s[1]]
+    still = np.concatenate([np.empty((0, field.cells)), *(columns for columns, _ in active)])
+    slope = 0.5 * (field.smooth_r + field.smooth_q)
     drift_information, drift_vector = _of_drifts(field, noise)
     own = [1.0 / sigma**2 for columns, sigma in active for _ in columns]
     information = np.diag(np.concatenate([np.zeros(6), own]))
     information[:6, :6] = drift_information
     return Design(
-        columns=np.concatenate([*moved, *(columns for columns, _ in active)]),
+        columns=np.concatenate([_moved(slope, field), still]),
         information=information,
         vector=np.concatenate([drift_vector, np.zeros(len(own))]),
     )
+
+
+def _moved(slope: Array, field: Aligned) -> Array:
+    """Return the columns (6, N) of shift and drifts by the slopes (2, N)."""
+    first, second = field.spans
+    return np.concatenate([slope, -slope * first.age_s, slope * second.age_s])
+
+
+def curvature(field: Aligned, design: Design) -> Array:
+    """Return how the weighted differences change with the unknowns, (p, p).
+
+    Smooth slopes of each grid meet slopes of the other, whose noise is independent: noise makes no
+    information then, nor does smoothing take any away. They are instrumental variables for them
+    (Wooldridge, Econometric Analysis of Cross Section and Panel Data, chapter 5).
+    """
+    still, weight = design.columns[6:], 1.0 / field.variance_m2
+    pairs = ((field.smooth_r, field.slope_q), (field.smooth_q, field.slope_r))
+    halves = [
+        (np.concatenate([_moved(smooth, field), still]) * weight)
+        @ np.concatenate([_moved(slope, field), still]).T
+        for smooth, slope in pairs
+    ]
+    both = 0.5 * (halves[0] + halves[1])
+    return np.asarray(0.5 * (both + both.T))
 
 
 def _of_drifts(field: Aligned, noise: NoiseModel) -> tuple[Array, Array]:

@@ -89,9 +89,6 @@ class MatchingSettings(Settings):
     hint_gain: float = setting(
         0.5, "", "share of the prior's variance that a hint must leave along some axis", minimum=0.0
     )
-    slope_smoothing_cells: float = setting(
-        0.5, "cells", "keeps sounding noise out of the slopes", minimum=0.1
-    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

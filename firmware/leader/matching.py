@@ -7,7 +7,7 @@ from scipy import ndimage
 
 from firmware.geometry import Array
 from firmware.leader import ambiguity
-from firmware.leader.alignment import Aligned, fields_of
+from firmware.leader.alignment import Aligned
 from firmware.leader.ambiguity import Prior
 from firmware.leader.covariance import Refined, measure
 from firmware.leader.drifts import NO_DRIFT, Drifts, screened_by_drift
@@ -156,11 +156,7 @@ def _refine_best(
     problem: PairProblem,
 ) -> list[_Candidate]:
     """Return the refined minima among the best lattice shifts."""
-    fields = (
-        fields_of(problem.reference, problem.settings.slope_smoothing_cells),
-        fields_of(problem.query, problem.settings.slope_smoothing_cells),
-    )
-    inverse = np.linalg.inv(prior.covariance_m2)
+    fields, inverse = problem.fields(), np.linalg.inv(prior.covariance_m2)
     candidates = []
     for start_m in _starts(surface, found.mass, problem.settings.basins):
         field = refine(problem.reference, problem.query, fields, start_m, problem.noise)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware.geometry import Array
-from firmware.leader.alignment import Belief, NoiseModel
+from firmware.leader.alignment import Belief, NoiseModel, fields_of
 from firmware.leader.ambiguity import Relief, background
 from firmware.leader.matches import ANY_PAIR, MatchingSettings, PairSigmas
 from firmware.leader.relief import (
@@ -14,6 +14,7 @@ from firmware.leader.relief import (
     WaveNoise,
     fine_relief_m2,
     information_per_cell,
+    smoothing_cells,
     spectrum,
 )
 from firmware.leader.screening import (
@@ -69,6 +70,20 @@ class PairProblem:
                 return None
             layers.append(bare.charged(*charge))
         return error_surface(layers[0], layers[1], self.minimum_cells, self.ridge_cells)
+
+    def fields(self) -> tuple[Array, Array]:
+        """Return the fields of both layers, with slopes as smooth as noise makes them need to be.
+
+        A reconstruction has hardly any.
+        """
+        return (
+            self._fields(self.reference, self.spectra[0]),
+            self._fields(self.query, self.spectra[1]),
+        )
+
+    def _fields(self, layer: Layer, relief: Spectrum) -> Array:
+        noise_m2 = 0.0 if layer.grid.reconstructed else _per_cell(layer.map_m2, layer)
+        return fields_of(layer, smoothing_cells(relief, noise_m2))
 
     def error_at(self, shift_m: Array, *, absolute: bool) -> tuple[float, int, float]:
         """Return E at any shift, the overlap in cells and the depth offset."""

@@ -16,11 +16,15 @@ It grows with relief and overlap, is zero on a flat seabed, and falls off as a p
 than exponentially, so that misfit beyond the noise model cannot let a small, lucky overlap win.
 """
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from firmware.geometry import Array
 from firmware.leader.screening import ErrorSurface
@@ -230,11 +234,34 @@ def ridge_of(
     )
 
 
-def mass_elsewhere(found: Posterior, winner_m: Array, radius_m: float) -> MassElsewhere:
-    """Return the mass outside the winner's basin, and outside the line through it."""
+def _falling_to(misfit: Array, shift: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return the shifts (K, L) from which steepest descent leads where it leads from one of them."""
+    rows, columns = misfit.shape
+    walled = np.pad(misfit, 1, constant_values=np.inf)
+    steps = sorted(itertools.product(range(3), repeat=2), key=lambda step: step != (1, 1))
+    around = np.stack([walled[i : i + rows, j : j + columns] for i, j in steps])
+    step = np.array(steps)[np.argmin(around, axis=0)] - 1
+    here = np.arange(misfit.size).reshape(misfit.shape)
+    lower = (here + columns * step[..., 0] + step[..., 1]).ravel()
+    falls = coo_array((np.ones(misfit.size), (here.ravel(), lower)), shape=2 * (misfit.size,))
+    _, basins = connected_components(falls, directed=False)
+    same = basins.reshape(misfit.shape) == basins[here[shift]]
+    return np.asarray(same & np.isfinite(misfit))
+
+
+def mass_elsewhere(
+    found: Posterior, surface: ErrorSurface, winner_m: Array, radius_m: float
+) -> MassElsewhere:
+    """Return the mass outside the winner's basin, and outside the line through it.
+
+    The basin has all shifts within the radius, and those from which misfit falls all the way to
+    the winner: how far up its slopes the truth may lie is what the match's covariance says.
+    """
     north = (found.north_m - winner_m[0])[:, None]
     east = (found.east_m - winner_m[1])[None, :]
-    inside = found.mass[north**2 + east**2 <= radius_m**2]
+    nearest = int(np.argmin(north**2)), int(np.argmin(east**2))
+    basin = (north**2 + east**2 <= radius_m**2) | _falling_to(surface.misfit, nearest)
+    inside = found.mass[basin]
     crossed = np.sum(found.mass * north * east)
     second = [
         [np.sum(found.mass * north**2), crossed],

@@ -217,7 +217,7 @@ def _decide(
     covariance = refined.covariance_m2 * settings.covariance_scale
     values, vectors = np.linalg.eigh(covariance)
     sigmas = np.sqrt(values)
-    elsewhere = ambiguity.mass_elsewhere(found, refined.shift_m, settings.basin_m)
+    elsewhere = ambiguity.mass_elsewhere(found, surface, refined.shift_m, settings.basin_m)
     certain = elsewhere.false_mass <= settings.false_mass_limit
     walk = np.eye(2) * refined.walk_m2
     if certain and sigmas[1] <= settings.sigma_limit_m:

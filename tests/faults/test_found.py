@@ -21,5 +21,5 @@ def test_a_grid_of_one_row_has_no_slopes_and_stops_no_match(shape: tuple[int, in
     layer = prepare(grid)
     assert layer is not None
     fields = fields_of(layer, 0.5)
-    assert fields.shape == (5, *shape)
+    assert fields.shape == (7, *shape)
     assert np.isnan(fields).all()

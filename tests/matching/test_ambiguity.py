@@ -85,10 +85,29 @@ def test_mass_is_told_apart_by_the_winner_and_by_its_line() -> None:
         row = np.searchsorted(NORTH_M, winner_m[0] + north_m)
         mass[row, np.searchsorted(EAST_M, winner_m[1] + east_m)] = share
     found = Posterior(north_m=NORTH_M, east_m=EAST_M, mass=mass, outside=0.02)
-    elsewhere = mass_elsewhere(found, winner_m, 5.0)
+    rough = surface_of(np.random.default_rng(1).uniform(0.1, 0.2, SHAPE))  # each has its minimum
+    elsewhere = mass_elsewhere(found, rough, winner_m, 5.0)
     assert elsewhere.false_mass == pytest.approx(0.4)
     assert elsewhere.false_mass_off_line == pytest.approx(0.1)
     assert elsewhere.axis_rad == pytest.approx(np.arctan2(2.0, -1.0), abs=0.01)
+
+
+@pytest.mark.parametrize(("beyond_m", "false_mass"), [(0.0, 0.0), (20.0, 0.3)])
+def test_mass_on_the_slopes_down_to_the_winner_is_not_elsewhere(
+    beyond_m: float, false_mass: float
+) -> None:
+    """Two minima lie 40 m apart; mass lies on the winner's side of what parts them, or beyond."""
+    residual_m2 = 0.04 + 0.001 * np.minimum(
+        np.abs(NORTH_M[:, None]), np.abs(NORTH_M[:, None] - 40.0)
+    ) * np.ones(EAST_M.size)
+    residual_m2 += 0.001 * np.abs(EAST_M)
+    residual_m2[:, EAST_M > 20.0] = np.inf  # no overlap there
+    mass = np.zeros(SHAPE)
+    for north_m, share in ((0.0, 0.7), (10.0 + beyond_m, 0.3)):
+        mass[np.searchsorted(NORTH_M, north_m), np.searchsorted(EAST_M, 0.0)] = share
+    found = Posterior(north_m=NORTH_M, east_m=EAST_M, mass=mass, outside=0.0)
+    elsewhere = mass_elsewhere(found, surface_of(residual_m2), np.array([0.3, 0.4]), 5.0)
+    assert elsewhere.false_mass == pytest.approx(false_mass)
 
 
 @pytest.mark.parametrize("cells", [200.0, 500.0])

@@ -38,6 +38,7 @@ _LEAST_RIDGE = 5  # shifts that fit; fewer have no direction
 _RIDGE_SIGMA_RAD = 0.01  # of its direction: half a degree of heading between two passes
 _UNTRACED_RAD = 0.3  # where too few shifts fit to follow it: slopes at the winner tell little
 PRIOR_DOUBTED = 3.0  # sigmas of it, where a ridge's direction still has to hold
+_FARTHEST_UP = 2.0  # radii, to which a match's covariance is believed
 _LEAST_GAIN = 0.3  # f(1) of a background of 2.3; below it the surface hardly has a minimum
 
 
@@ -254,13 +255,15 @@ def mass_elsewhere(
 ) -> MassElsewhere:
     """Return the mass outside the winner's basin, and outside the line through it.
 
-    The basin has all shifts within the radius, and those from which misfit falls all the way to
-    the winner: how far up its slopes the truth may lie is what the match's covariance says.
+    The basin has all shifts within the radius, and those as far again from which misfit falls all
+    the way to the winner: how far up its slopes the truth may lie the match's covariance says.
     """
     north = (found.north_m - winner_m[0])[:, None]
     east = (found.east_m - winner_m[1])[None, :]
     nearest = int(np.argmin(north**2)), int(np.argmin(east**2))
-    basin = (north**2 + east**2 <= radius_m**2) | _falling_to(surface.misfit, nearest)
+    distance_m = np.hypot(north, east)
+    basin = _falling_to(surface.misfit, nearest) & (distance_m <= _FARTHEST_UP * radius_m)
+    basin |= distance_m <= radius_m
     inside = found.mass[basin]
     crossed = np.sum(found.mass * north * east)
     second = [

@@ -103,7 +103,7 @@ def test_mass_on_the_slopes_down_to_the_winner_is_not_elsewhere(
     residual_m2 += 0.001 * np.abs(EAST_M)
     residual_m2[:, EAST_M > 20.0] = np.inf  # no overlap there
     mass = np.zeros(SHAPE)
-    for north_m, share in ((0.0, 0.7), (10.0 + beyond_m, 0.3)):
+    for north_m, share in ((0.0, 0.7), (8.0 + beyond_m, 0.3)):
         mass[np.searchsorted(NORTH_M, north_m), np.searchsorted(EAST_M, 0.0)] = share
     found = Posterior(north_m=NORTH_M, east_m=EAST_M, mass=mass, outside=0.0)
     elsewhere = mass_elsewhere(found, surface_of(residual_m2), np.array([0.3, 0.4]), 5.0)

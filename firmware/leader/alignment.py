@@ -42,7 +42,7 @@ class Belief:
         moved[:2, 2:4] = (times_s[0] - self.times_s[0]) * np.eye(2)
         moved[:2, 4:] = (self.times_s[1] - times_s[1]) * np.eye(2)
         both = moved @ self.covariance @ moved.T
-        gain = np.linalg.solve(both[:2, :2] + _TINY_M2 * np.eye(2), both[:2, 2:]).T
+        gain = np.asarray(np.linalg.solve(both[:2, :2] + _TINY_M2 * np.eye(2), both[:2, 2:]).T)
         return gain, both[2:, 2:] - gain @ both[:2, 2:]
 
 

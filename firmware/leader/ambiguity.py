@@ -235,19 +235,25 @@ def ridge_of(
     )
 
 
-def _falling_to(misfit: Array, shift: tuple[int, int]) -> NDArray[np.bool_]:
-    """Return the shifts (K, L) from which steepest descent leads where it leads from one of them."""
-    rows, columns = misfit.shape
-    walled = np.pad(misfit, 1, constant_values=np.inf)
+def _falling_to(misfit: Array, shift: tuple[int, int], reach: int) -> NDArray[np.bool_]:
+    """Return the shifts (K, L) from which steepest descent leads where it leads from one of them.
+
+    It must not lead farther from that one than its reach along either axis.
+    """
+    near = tuple(slice(max(at - reach, 0), at + reach + 1) for at in shift)
+    window = misfit[near]
+    rows, columns = window.shape
+    walled = np.pad(window, 1, constant_values=np.inf)
     steps = sorted(itertools.product(range(3), repeat=2), key=lambda step: step != (1, 1))
     around = np.stack([walled[i : i + rows, j : j + columns] for i, j in steps])
-    step = np.array(steps)[np.argmin(around, axis=0)] - 1
-    here = np.arange(misfit.size).reshape(misfit.shape)
-    lower = (here + columns * step[..., 0] + step[..., 1]).ravel()
-    falls = coo_array((np.ones(misfit.size), (here.ravel(), lower)), shape=2 * (misfit.size,))
-    _, basins = connected_components(falls, directed=False)
-    same = basins.reshape(misfit.shape) == basins[here[shift]]
-    return np.asarray(same & np.isfinite(misfit))
+    onward = np.array([columns * (i - 1) + j - 1 for i, j in steps])
+    here = np.arange(window.size)
+    lower = here + onward[np.argmin(around, axis=0)].ravel()
+    falls = coo_array((np.ones(window.size), (here, lower)), shape=2 * (window.size,))
+    labels = connected_components(falls, directed=False)[1].reshape(window.shape)
+    falling = np.zeros(misfit.shape, dtype=bool)
+    falling[near] = labels == labels[min(shift[0], reach), min(shift[1], reach)]
+    return falling & np.isfinite(misfit)
 
 
 def mass_elsewhere(
@@ -261,8 +267,9 @@ def mass_elsewhere(
     north = (found.north_m - winner_m[0])[:, None]
     east = (found.east_m - winner_m[1])[None, :]
     nearest = int(np.argmin(north**2)), int(np.argmin(east**2))
-    distance_m = np.hypot(north, east)
-    basin = _falling_to(surface.misfit, nearest) & (distance_m <= _FARTHEST_UP * radius_m)
+    distance_m, farthest_m = np.hypot(north, east), _FARTHEST_UP * radius_m
+    reach = round(farthest_m / float(found.north_m[1] - found.north_m[0]))
+    basin = _falling_to(surface.misfit, nearest, reach) & (distance_m <= farthest_m)
     basin |= distance_m <= radius_m
     inside = found.mass[basin]
     crossed = np.sum(found.mass * north * east)

@@ -10,7 +10,6 @@ from firmware.geometry import Array
 from firmware.leader.alignment import Aligned, NoiseModel
 from firmware.leader.design import Design, curvature, design_of, solve
 
-
 _TOLD_BY_BOTH = 0.25  # of slopes, without which the grids do not show the same relief
 
 

@@ -45,9 +45,7 @@ class Drifts:
         """Return their covariance (4, 4) in (m/s)^2 where the offset is known to (2, 2)."""
         return np.asarray(self.left + self.gain @ offset_m2 @ self.gain.T)
 
-    def belief(
-        self, prior: Prior, reference: GriddedSubmap, query: GriddedSubmap
-    ) -> Belief:
+    def belief(self, prior: Prior, reference: GriddedSubmap, query: GriddedSubmap) -> Belief:
         """Return how the shift of two grids, of which the expected drift was taken, goes with both.
 
         The prior is that of the shift between the middles of their times.

@@ -59,7 +59,8 @@ def match(
     window that the prior implies, the best minima are refined below the cell, and the winner has
     to pass the threshold, carry evidence against unrelated seabed and leave little posterior mass
     elsewhere. The fit holds every shift with the drifts that it implies. A pair that fails leaves a
-    hint, if one is asked for; then the screening does so, too. The prior is that of the shift: mean (2,) and covariance (2, 2).
+    hint, if one is asked for; then the screening does so, too. The prior is that of the shift: mean
+    (2,) and covariance (2, 2).
 
     Raises
     ------

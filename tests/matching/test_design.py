@@ -101,9 +101,7 @@ def test_a_shift_is_fitted_with_the_drift_that_it_implies() -> None:
     drift_mps, apart_s, sigma_mps = np.array([0.04, -0.03]), 20.0, 0.2
     truth_m = -drift_mps * apart_s
     prior = Prior(np.zeros(2), (sigma_mps * apart_s) ** 2 * np.eye(2))
-    beside = Drifts(
-        gain=np.zeros((4, 2)), left=sigma_mps**2 * np.eye(4)
-    )
+    beside = Drifts(gain=np.zeros((4, 2)), left=sigma_mps**2 * np.eye(4))
     implied = Drifts(gain=np.tile(-np.eye(2) / apart_s, (2, 1)), left=1e-8 * np.eye(4))
     errors_m, sigmas_m = [], []
     for drifts in (beside, implied):

@@ -21,7 +21,7 @@ _LEAST_CELLS = 12  # fewer cells than unknowns determine nothing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Belief:
+class Coupling:
     """What is believed of a pair before its match: the shift, and how it goes with the drifts.
 
     covariance (6, 6) is that of the shift between times_s of both, of the drift of the reference
@@ -46,7 +46,7 @@ class Belief:
         return gain, both[2:, 2:] - gain @ both[:2, 2:]
 
 
-KNOWN_DRIFT = Belief(mean_m=np.zeros(2), covariance=np.zeros((6, 6)), times_s=(0.0, 0.0))
+UNCOUPLED = Coupling(mean_m=np.zeros(2), covariance=np.zeros((6, 6)), times_s=(0.0, 0.0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,7 +66,7 @@ class NoiseModel:
     walk_m2_per_s: float
     correlation_m: float
     correlated_share: float
-    belief: Belief = KNOWN_DRIFT
+    coupling: Coupling = UNCOUPLED
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -78,12 +78,12 @@ def _of_drifts(field: Aligned, noise: NoiseModel) -> tuple[Array, Array]:
 
     A shift too large by u implies the drifts gain (shift - u - mean).
     """
-    belief, (first, second) = noise.belief, field.spans
-    gain, left = belief.drifts_at((first.mean_s, second.mean_s))
+    coupling, (first, second) = noise.coupling, field.spans
+    gain, left = coupling.drifts_at((first.mean_s, second.mean_s))
     alone = max(noise.drift_sigma_mps, _UNKNOWN_MPS)
     implied = np.hstack([gain, np.eye(4)])
     weighted = implied.T @ np.linalg.inv(left + alone**2 * np.eye(4))
-    return weighted @ implied, weighted @ gain @ (field.shift_m - belief.mean_m)
+    return weighted @ implied, weighted @ gain @ (field.shift_m - coupling.mean_m)
 
 
 def solve(field: Aligned, design: Design) -> Array:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware.geometry import Array
-from firmware.leader.alignment import Belief
+from firmware.leader.alignment import Coupling
 from firmware.leader.ambiguity import Prior
 from firmware.leader.pair_problem import PairProblem
 from firmware.leader.screening import ErrorSurface
@@ -45,13 +45,13 @@ class Drifts:
         """Return their covariance (4, 4) in (m/s)^2 where the offset is known to (2, 2)."""
         return np.asarray(self.left + self.gain @ offset_m2 @ self.gain.T)
 
-    def belief(self, prior: Prior, reference: GriddedSubmap, query: GriddedSubmap) -> Belief:
+    def coupling(self, prior: Prior, reference: GriddedSubmap, query: GriddedSubmap) -> Coupling:
         """Return how the shift of two grids, of which the expected drift was taken, goes with both.
 
         The prior is that of the shift between the middles of their times.
         """
         told = self.gain @ prior.covariance_m2
-        return Belief(
+        return Coupling(
             mean_m=prior.mean_m,
             covariance=np.block(
                 [[prior.covariance_m2, told.T], [told, self.covariance(prior.covariance_m2)]]

@@ -71,7 +71,7 @@ def match(
     if problem is None:
         return _none(NoMatch.EMPTY)
     prior = Prior(np.asarray(prior_shift_m), _checked(prior_covariance_m2))
-    problem = problem.believing(drifts.belief(prior, reference, query))
+    problem = problem.coupled(drifts.coupling(prior, reference, query))
     whole = problem.surface()
     surface = _window(whole, prior, problem)
     if surface is None or not np.isfinite(surface.residual_m2).any():

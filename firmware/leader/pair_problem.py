@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware.geometry import Array
-from firmware.leader.alignment import Belief, NoiseModel, fields_of
+from firmware.leader.alignment import Coupling, NoiseModel, fields_of
 from firmware.leader.ambiguity import Relief, background
 from firmware.leader.matches import ANY_PAIR, MatchingSettings, PairSigmas
 from firmware.leader.relief import (
@@ -53,9 +53,9 @@ class PairProblem:
     slope2: float
     charges_m2: tuple[tuple[float, float], ...]  # of each layer; see Layer.charged
 
-    def believing(self, belief: Belief) -> "PairProblem":
+    def coupled(self, coupling: Coupling) -> "PairProblem":
         """Return the problem where so much is believed of shift and drifts."""
-        return dataclasses.replace(self, noise=dataclasses.replace(self.noise, belief=belief))
+        return dataclasses.replace(self, noise=dataclasses.replace(self.noise, coupling=coupling))
 
     def surface(self) -> ErrorSurface:
         """Return E at every lattice shift."""

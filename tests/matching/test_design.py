@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from firmware.geometry import Array
-from firmware.leader.alignment import Belief, align
+from firmware.leader.alignment import Coupling, align
 from firmware.leader.ambiguity import Prior
 from firmware.leader.covariance import measure
 from firmware.leader.design import design_of
@@ -31,12 +31,12 @@ def test_shift_between_other_times_has_run_on_with_the_drifts() -> None:
     """Told by a hundred thousand pairs: shift and drifts at some times, shift at others."""
     rng = np.random.default_rng(1)
     root = rng.standard_normal((6, 6)) * np.array([5.0, 5.0, 0.2, 0.2, 0.1, 0.1])[:, None]
-    belief = Belief(mean_m=np.zeros(2), covariance=root @ root.T, times_s=(100.0, 300.0))
+    coupling = Coupling(mean_m=np.zeros(2), covariance=root @ root.T, times_s=(100.0, 300.0))
     pairs = root @ rng.standard_normal((6, 100_000))
     reference_mps, query_mps = pairs[2:4], pairs[4:]
     # a cell of the query lies drift times age too far along: it takes a shift that much smaller
     shift_m = pairs[:2] + 7.0 * reference_mps + 12.0 * query_mps
-    gain, left = belief.drifts_at((107.0, 288.0))
+    gain, left = coupling.drifts_at((107.0, 288.0))
     told = np.cov(np.vstack([shift_m, pairs[2:]]))
     expected = np.linalg.solve(told[:2, :2], told[:2, 2:]).T
     assert gain == pytest.approx(expected, rel=0.05, abs=0.001)
@@ -114,7 +114,7 @@ def test_a_shift_is_fitted_with_the_drift_that_it_implies() -> None:
             )
             problem = pair_problem(reference, query, PLAIN, LEVEL)
             assert problem is not None
-            problem = problem.believing(drifts.belief(prior, reference, query))
+            problem = problem.coupled(drifts.coupling(prior, reference, query))
             field = refine(
                 problem.reference, problem.query, problem.fields(), truth_m, problem.noise
             )

@@ -38,7 +38,6 @@ _LEAST_RIDGE = 5  # shifts that fit; fewer have no direction
 _RIDGE_SIGMA_RAD = 0.01  # of its direction: half a degree of heading between two passes
 _UNTRACED_RAD = 0.3  # where too few shifts fit to follow it: slopes at the winner tell little
 PRIOR_DOUBTED = 3.0  # sigmas of it, where a ridge's direction still has to hold
-_FARTHEST_UP = 2.0  # radii, to which a match's covariance is believed
 _LEAST_GAIN = 0.3  # f(1) of a background of 2.3; below it the surface hardly has a minimum
 
 
@@ -235,25 +234,18 @@ def ridge_of(
     )
 
 
-def _falling_to(misfit: Array, shift: tuple[int, int], reach: int) -> NDArray[np.bool_]:
-    """Return the shifts (K, L) from which steepest descent leads where it leads from one of them.
-
-    It must not lead farther from that one than its reach along either axis.
-    """
-    near = tuple(slice(max(at - reach, 0), at + reach + 1) for at in shift)
-    window = misfit[near]
-    rows, columns = window.shape
-    walled = np.pad(window, 1, constant_values=np.inf)
+def _falling_with(misfit: Array, shift: int) -> NDArray[np.bool_]:
+    """Return the shifts (K, L) from which steepest descent ends where it ends from one of them."""
+    rows, columns = misfit.shape
+    walled = np.pad(misfit, 1, constant_values=np.inf)
     steps = sorted(itertools.product(range(3), repeat=2), key=lambda step: step != (1, 1))
     around = np.stack([walled[i : i + rows, j : j + columns] for i, j in steps])
     onward = np.array([columns * (i - 1) + j - 1 for i, j in steps])
-    here = np.arange(window.size)
+    here = np.arange(misfit.size)
     lower = here + onward[np.argmin(around, axis=0)].ravel()
-    falls = coo_array((np.ones(window.size), (here, lower)), shape=2 * (window.size,))
-    labels = connected_components(falls, directed=False)[1].reshape(window.shape)
-    falling = np.zeros(misfit.shape, dtype=bool)
-    falling[near] = labels == labels[min(shift[0], reach), min(shift[1], reach)]
-    return falling & np.isfinite(misfit)
+    falls = coo_array((np.ones(misfit.size), (here, lower)), shape=2 * (misfit.size,))
+    basins = connected_components(falls, directed=False)[1]
+    return np.asarray(basins == basins[shift]).reshape(misfit.shape)
 
 
 def mass_elsewhere(
@@ -261,16 +253,15 @@ def mass_elsewhere(
 ) -> MassElsewhere:
     """Return the mass outside the winner's basin, and outside the line through it.
 
-    The basin has all shifts within the radius, and those as far again from which misfit falls all
-    the way to the winner: how far up its slopes the truth may lie the match's covariance says.
+    The basin has all shifts within the radius, and those from which misfit falls to where it falls
+    from the winner. That may lie beside it, since the lattice's fit knows no tilt and no drift; how
+    far up the slopes the truth may lie is what the match's covariance says.
     """
     north = (found.north_m - winner_m[0])[:, None]
     east = (found.east_m - winner_m[1])[None, :]
-    nearest = int(np.argmin(north**2)), int(np.argmin(east**2))
-    distance_m, farthest_m = np.hypot(north, east), _FARTHEST_UP * radius_m
-    reach = round(farthest_m / float(found.north_m[1] - found.north_m[0]))
-    basin = _falling_to(surface.misfit, nearest, reach) & (distance_m <= farthest_m)
-    basin |= distance_m <= radius_m
+    square_m2 = north**2 + east**2
+    basin = square_m2 <= radius_m**2
+    basin |= _falling_with(surface.misfit, int(np.argmin(square_m2)))
     inside = found.mass[basin]
     crossed = np.sum(found.mass * north * east)
     second = [

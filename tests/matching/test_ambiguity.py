@@ -92,22 +92,38 @@ def test_mass_is_told_apart_by_the_winner_and_by_its_line() -> None:
     assert elsewhere.axis_rad == pytest.approx(np.arctan2(2.0, -1.0), abs=0.01)
 
 
-@pytest.mark.parametrize(("beyond_m", "false_mass"), [(0.0, 0.0), (20.0, 0.3)])
+@pytest.mark.parametrize(
+    ("second_m", "at_m", "false_mass"),
+    [(40.0, 18.0, 0.0), (40.0, 28.0, 0.3), (12.0, 8.0, 0.3), (12.0, 4.0, 0.0)],
+)
+@pytest.mark.parametrize("turned", [False, True])
 def test_mass_on_the_slopes_down_to_the_winner_is_not_elsewhere(
-    beyond_m: float, false_mass: float
+    second_m: float, at_m: float, false_mass: float, *, turned: bool
 ) -> None:
-    """Two minima lie 40 m apart; mass lies on the winner's side of what parts them, or beyond."""
-    residual_m2 = 0.04 + 0.001 * np.minimum(
-        np.abs(NORTH_M[:, None]), np.abs(NORTH_M[:, None] - 40.0)
-    ) * np.ones(EAST_M.size)
-    residual_m2 += 0.001 * np.abs(EAST_M)
+    """Two minima: mass lies on the winner's side of what parts them, or beyond."""
+    apart_m = np.minimum(np.abs(NORTH_M), np.abs(NORTH_M - second_m))
+    residual_m2 = 0.04 + 0.001 * (apart_m[:, None] + np.abs(EAST_M))
     residual_m2[:, EAST_M > 20.0] = np.inf  # no overlap there
     mass = np.zeros(SHAPE)
-    for north_m, share in ((0.0, 0.7), (8.0 + beyond_m, 0.3)):
-        mass[np.searchsorted(NORTH_M, north_m), np.searchsorted(EAST_M, 0.0)] = share
+    for north_m, share in ((0.0, 0.7), (at_m, 0.3)):
+        mass[np.searchsorted(NORTH_M, north_m), np.searchsorted(EAST_M, 0.0)] += share
+    surface = surface_of(residual_m2)
     found = Posterior(north_m=NORTH_M, east_m=EAST_M, mass=mass, outside=0.0)
-    elsewhere = mass_elsewhere(found, surface_of(residual_m2), np.array([0.3, 0.4]), 5.0)
+    if turned:
+        noise_m2 = np.full(SHAPE[::-1], 0.04)
+        surface = dataclasses.replace(surface, residual_m2=residual_m2.T, noise_m2=noise_m2)
+        found = Posterior(north_m=EAST_M, east_m=NORTH_M, mass=mass.T, outside=0.0)
+    elsewhere = mass_elsewhere(found, surface, np.array([0.3, 0.4]), 5.0)
     assert elsewhere.false_mass == pytest.approx(false_mass)
+
+
+def test_a_winner_on_the_slope_to_a_minimum_has_the_mass_of_that() -> None:
+    """The lattice's minimum lies 8 m beside the winner: its fit knows neither tilt nor drift."""
+    residual_m2 = 0.04 + 0.001 * (np.abs(NORTH_M[:, None] - 8.0) + np.abs(EAST_M))
+    mass = np.zeros(SHAPE)
+    mass[np.searchsorted(NORTH_M, 8.0), np.searchsorted(EAST_M, 0.0)] = 1.0
+    found = Posterior(north_m=NORTH_M, east_m=EAST_M, mass=mass, outside=0.0)
+    assert mass_elsewhere(found, surface_of(residual_m2), np.zeros(2), 5.0).false_mass == 0.0
 
 
 @pytest.mark.parametrize("cells", [200.0, 500.0])

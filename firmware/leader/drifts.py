@@ -7,7 +7,7 @@ which that other drift was taken.
 
 import dataclasses
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,25 +34,27 @@ _NO_OVERLAP = np.array([np.inf, 1.0, 0.0, 0.0])  # in the same order
 class Drifts:
     """How well the drifts of two sub-maps are known, and what their offset would tell of them.
 
-    gain (4, 2) is how much they change, the origin's first, per metre of offset beyond the expected
-    one; left (4, 4) in (m/s)^2 is their covariance once the offset is known.
+    gain (4, 2) is how much they change, the origin's first, per metre of offset beyond expected_m
+    (2,), beside which they are what the estimate says; left (4, 4) in (m/s)^2 is their covariance
+    once the offset is known.
     """
 
     gain: Array
     left: Array
+    expected_m: Array = field(default_factory=lambda: np.zeros(2))
 
     def covariance(self, offset_m2: Array) -> Array:
         """Return their covariance (4, 4) in (m/s)^2 where the offset is known to (2, 2)."""
         return np.asarray(self.left + self.gain @ offset_m2 @ self.gain.T)
 
     def coupling(self, prior: Prior, reference: GriddedSubmap, query: GriddedSubmap) -> Coupling:
-        """Return how the shift of two grids, of which the expected drift was taken, goes with both.
+        """Return how the shift of two grids goes with the drifts that were not taken out of them.
 
         The prior is that of the shift between the middles of their times.
         """
         told = self.gain @ prior.covariance_m2
         return Coupling(
-            mean_m=prior.mean_m,
+            mean_m=self.expected_m,
             covariance=np.block(
                 [[prior.covariance_m2, told.T], [told, self.covariance(prior.covariance_m2)]]
             ),
@@ -142,7 +144,8 @@ def _without(grid: GriddedSubmap, drift_mps: Array) -> GriddedSubmap:
 
 
 def _middle_s(grid: GriddedSubmap) -> float:
-    return float(np.nanmedian(grid.time_s))
+    known_s = grid.time_s[np.isfinite(grid.time_s)]
+    return float(np.median(known_s)) if known_s.size else 0.0
 
 
 def _fields(surface: ErrorSurface) -> Array:

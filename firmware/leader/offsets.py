@@ -101,16 +101,17 @@ class Offsets:
         told = gains @ covariances_m2 @ gains.swapaxes(1, 2)
         left = _DRIFTS @ both @ _DRIFTS.T - told
         moves_m = corrections([self._sheets[sheet_id] for sheet_id in rows], self._estimate)
+        shifts_m = moves_m[ends[:, 1]] - moves_m[ends[:, 0]]
         return [
             Offset(
                 origin=origin,
                 target=target,
-                shift_m=moves_m[end[1]] - moves_m[end[0]],
+                shift_m=shifts_m[k],
                 covariance_m2=covariances_m2[k],
                 apart_m2=self._anchors[origin.id].apart_m2 + self._anchors[target.id].apart_m2,
-                drifts=Drifts(gain=gains[k], left=left[k]),
+                drifts=Drifts(gain=gains[k], left=left[k], expected_m=shifts_m[k]),
             )
-            for k, ((origin, target), end) in enumerate(zip(placed, ends, strict=True))
+            for k, (origin, target) in enumerate(placed)
         ]
 
     def _place(self, sheets: Iterable[Sheet]) -> None:

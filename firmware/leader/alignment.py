@@ -25,8 +25,8 @@ class Coupling:
     """What is believed of a pair before its match: the shift, and how it goes with the drifts.
 
     covariance (6, 6) is that of the shift between times_s of both, of the drift of the reference
-    and of that of the query, in m and m/s. mean_m (2,) is the shift's; of the grids the mean drift
-    was taken.
+    and of that of the query, in m and m/s. A shift of mean_m (2,) implies the drifts that the grids
+    were rid of, others imply more or less.
     """
 
     mean_m: Array
@@ -51,7 +51,7 @@ UNCOUPLED = Coupling(mean_m=np.zeros(2), covariance=np.zeros((6, 6)), times_s=(0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NoiseModel:
-    """Standard deviations that the fit assumes; all may be zero but cell_sigma_m.
+    """What the fit assumes: standard deviations, which may be zero but for cell_sigma_m, and drift.
 
     correlated_share is the share of a cell's variance that is alike within correlation_m.
     drift_sigma_mps is that of drifts beside what is believed of them.

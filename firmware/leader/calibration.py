@@ -18,7 +18,7 @@ from firmware.leader.swath import Swath
 from firmware.submaps import GriddedSubmap
 from protocol.settings import Settings, setting
 
-_SMOOTHING_CELLS = 0.5  # of slopes, as in the match
+_SMOOTHING_CELLS = 0.5  # of slopes
 _ITERATIONS = 4  # the shift's prior keeps the fit near its start
 
 

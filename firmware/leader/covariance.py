@@ -10,6 +10,7 @@ from firmware.geometry import Array
 from firmware.leader.alignment import Aligned, NoiseModel
 from firmware.leader.design import Design, curvature, design_of, solve
 
+_LEAST_TOLD_PER_M2 = 1e-6  # of a shift, which a kilometre's sigma has as well
 _TOLD_BY_BOTH = 0.25  # of slopes, without which the grids do not show the same relief
 
 
@@ -64,7 +65,7 @@ def _sandwich(
     slopes = design.columns[:2]
     values, vectors = np.linalg.eigh(found[:2, :2])
     steep = np.sum((vectors.T @ slopes) ** 2 / field.variance_m2, axis=1)
-    usable = values > _TOLD_BY_BOTH * steep
+    usable = values > np.maximum(_TOLD_BY_BOTH * steep, _LEAST_TOLD_PER_M2)
     rotated = np.eye(p)
     rotated[:2, :2] = vectors.T
     kept = rotated[np.concatenate([usable, np.ones(p - 2, dtype=bool)])]

@@ -14,10 +14,10 @@ _UNKNOWN_MPS = 1e-4  # least sigma of a drift: two millimetres at the ends of a 
 class Design:
     """Columns (p, N) by unknown, and their Gaussian prior: information (p, p) and its vector (p,).
 
-    The columns are made of smooth slopes and weigh the differences; what a change of the unknowns
-    does to these is told by `curvature`. The unknowns are how far the shift (2,) is too large, the
-    drift (2,) of the reference and of the query, and those of depth offset, tilt and bend whose
-    sigma is not zero, in this order.
+    The columns are made of smooth slopes: a fit is consistent where it says of the shift that it is
+    right, and `curvature` tells what a change of the unknowns does. The unknowns are how far the
+    shift (2,) is too large, the drift (2,) of the reference and of the query, and those of depth
+    offset, tilt and bend whose sigma is not zero, in this order.
     """
 
     columns: Array

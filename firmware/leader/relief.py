@@ -14,8 +14,8 @@ from firmware.geometry import Array
 from firmware.leader.screening import Layer
 
 _BAND = 3  # waves averaged each way: enough that noise alone never looks like relief
-_BAND_RAD_PER_M = 0.1  # of waves that count as equally long
-_RECTIFIED = 0.2  # of the noise: what is left of it where no power is taken for negative
+_BAND_RAD = 0.2  # a cell, of waves that count as equally long
+_RECTIFIED = 0.4  # of the noise: what is left of it where no power is taken for negative, and more
 _SMOOTHINGS = np.array([0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0])
 _LEAST_ENERGY = 16.0  # cells under the taper; fewer have no spectrum
 
@@ -86,17 +86,17 @@ def fine_relief_m2(relief: Spectrum, shortest_m: float) -> float:
 def smoothing_cells(relief: Spectrum, noise_m2: float) -> float:
     """Return the sigma of a Gaussian, in cells, by which slopes tell most of a shift.
 
-    Slopes through a filter h weigh what white noise of both the slopes' own grid and another one
-    adds. With power P of relief and W of noise at wave number k they tell
-    (sum k^2 h P)^2 / sum k^2 h^2 (P + W) of it.
+    Of slopes with power P of relief and W of their own noise at wave number k a filter h leaves
+    (sum k^2 h P)^2 / sum k^2 h^2 (P + W), where what they are weighed with is noisy and white.
     """
-    band = np.round(relief.wave / _BAND_RAD_PER_M).astype(np.intp).ravel()
+    width = _BAND_RAD / relief.cell_m
+    band = np.round(relief.wave / width).astype(np.intp).ravel()
     twice = np.full(relief.wave.shape, 2.0)  # of all waves half are stored
     twice[:, 0] = 1.0
     waves = np.bincount(band, twice.ravel())
     power_m2 = np.bincount(band, (twice * relief.power_m2).ravel()) / np.maximum(waves, 1.0)
     power_m2[power_m2 < _RECTIFIED * noise_m2] = 0.0
-    wave = _BAND_RAD_PER_M * np.arange(waves.size)
+    wave = width * np.arange(waves.size)
     kept = np.exp(-0.5 * (_SMOOTHINGS[:, None] * relief.cell_m * wave) ** 2)
     told = (kept @ (waves * wave**2 * power_m2)) ** 2
     told /= np.maximum(kept**2 @ (waves * wave**2 * (power_m2 + noise_m2)), 1e-30)

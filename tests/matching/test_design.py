@@ -12,8 +12,11 @@ from firmware.leader.covariance import measure
 from firmware.leader.design import design_of
 from firmware.leader.drifts import Drifts
 from firmware.leader.matches import MatchingSettings, PairSigmas
+from firmware.leader.matching import match
 from firmware.leader.pair_problem import noise_model, pair_problem
 from firmware.leader.refinement import refine
+from firmware.leader.relief import smoothing_cells, spectrum
+from firmware.leader.screening import prepare
 from firmware.submaps import GriddedSubmap
 from tests.matching.scenes import Scene
 
@@ -124,3 +127,68 @@ def test_a_shift_is_fitted_with_the_drift_that_it_implies() -> None:
         sigmas_m.append(np.sqrt(np.mean([np.trace(m.covariance_m2) for m in found])))
     assert sigmas_m[1] < 0.8 * sigmas_m[0]
     assert max(errors_m) < 0.3  # of 1 m; slopes are not those of cells that lie metres apart
+
+
+def _lines(seed: int) -> tuple[GriddedSubmap, GriddedSubmap]:
+    """Return sub-maps of one place without drift, on lines of opposite heading."""
+    scene = Scene(seed, rms_m=0.3)
+    first, second = (scene.submap(140, 150, (41, 60), sigma_m=0.1) for _ in range(2))
+    return first, dataclasses.replace(second, time_s=second.time_s[::-1] + 100.0)
+
+
+def test_a_match_hears_what_its_shift_implies() -> None:
+    still = dataclasses.replace(MatchingSettings(), walk_m2_per_s=0.0, drift_sigma_mps=0.0)
+    shifts_m = []
+    for expected_m in (0.0, 3.0):
+        drifts = Drifts(
+            gain=np.tile(-np.eye(2) / 20.0, (2, 1)),
+            left=1e-8 * np.eye(4),
+            expected_m=np.array([expected_m, 0.0]),
+        )
+        outcome = match(*_lines(1), np.zeros(2), 16.0 * np.eye(2), still, drifts=drifts)
+        assert outcome.match is not None
+        shifts_m.append(outcome.match.shift_m)
+    assert np.hypot(*shifts_m[0]) < 0.3
+    assert shifts_m[1][0] - shifts_m[0][0] > 0.3
+
+
+@pytest.mark.parametrize(("expected_m", "right"), [(0.0, True), (8.0, False)])
+def test_grids_were_rid_of_the_drift_of_the_expected_shift(
+    expected_m: float, *, right: bool
+) -> None:
+    drifts = Drifts(
+        gain=np.tile(-np.eye(2) / 20.0, (2, 1)),
+        left=1e-8 * np.eye(4),
+        expected_m=np.array([expected_m, 0.0]),
+    )
+    grids = _lines(2)
+    problem = pair_problem(*grids, PLAIN, LEVEL)
+    assert problem is not None
+    problem = problem.coupled(drifts.coupling(Prior(np.zeros(2), 16.0 * np.eye(2)), *grids))
+    field = refine(problem.reference, problem.query, problem.fields(), np.zeros(2), problem.noise)
+    assert field is not None
+    assert bool(np.hypot(*field.shift_m) < 0.15) is right
+
+
+@pytest.mark.parametrize(("sigma_m", "least"), [(0.001, 0.5), (0.3, 1.25)])
+def test_slopes_are_smoothed_as_much_as_noise_makes_it_worth(sigma_m: float, least: float) -> None:
+    layer = prepare(Scene(1, rms_m=0.1).submap(150, 150, (61, 61), sigma_m=sigma_m))
+    assert layer is not None
+    chosen = smoothing_cells(spectrum(layer), sigma_m**2)
+    assert chosen == least if least == 0.5 else chosen >= least
+
+
+def test_flat_seabed_tells_no_shift_however_surely_it_is_fitted() -> None:
+    flat = Scene(1).submap(150, 150, (41, 41), sigma_m=0.0, relief=_faintest)
+    drifts = Drifts(gain=np.tile(-np.eye(2) / 20.0, (2, 1)), left=1e-12 * np.eye(4))
+    problem = pair_problem(flat, flat, PLAIN, LEVEL)
+    assert problem is not None
+    problem = problem.coupled(drifts.coupling(Prior(np.zeros(2), np.eye(2)), flat, flat))
+    field = align(problem.reference, problem.query, problem.fields(), np.zeros(2), problem.noise)
+    assert field is not None
+    sigmas_m = np.sqrt(np.linalg.eigvalsh(measure(field, problem.noise).covariance_m2))
+    assert sigmas_m == pytest.approx(1000.0)
+
+
+def _faintest(north_m: Array, east_m: Array) -> Array:
+    return 40.0 + 1e-9 * np.sin(north_m / 7.0) * np.cos(east_m / 5.0)

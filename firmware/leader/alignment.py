@@ -15,7 +15,7 @@ from firmware.geometry import Array
 from firmware.leader.screening import Landing, Layer, land, sample
 
 _DEPTH, _VARIANCE, _TIME, _SLOPES, _SMOOTH = 0, 1, 2, slice(3, 5), slice(5, 7)  # of the fields
-_TINY_M2 = 1e-6  # two sub-maps of one node have no offset
+TINY_M2 = 1e-6  # two sub-maps of one node have no offset
 _LEAST_SHARE = 0.1  # of a smoothing that lies on known cells
 _LEAST_CELLS = 12  # fewer cells than unknowns determine nothing
 
@@ -42,7 +42,7 @@ class Coupling:
         moved[:2, 2:4] = (times_s[0] - self.times_s[0]) * np.eye(2)
         moved[:2, 4:] = (self.times_s[1] - times_s[1]) * np.eye(2)
         both = moved @ self.covariance @ moved.T
-        gain = np.asarray(np.linalg.solve(both[:2, :2] + _TINY_M2 * np.eye(2), both[:2, 2:]).T)
+        gain = np.asarray(np.linalg.solve(both[:2, :2] + TINY_M2 * np.eye(2), both[:2, 2:]).T)
         return gain, both[2:, 2:] - gain @ both[:2, 2:]
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from firmware.geometry import Array
+from firmware.leader.alignment import TINY_M2
 from firmware.leader.atlas import Sheet, SheetId
 from firmware.leader.drifts import Drifts
 from firmware.leader.estimate import Estimate
@@ -16,7 +17,6 @@ from protocol.errors import EstimationError
 
 _BETWEEN = np.hstack([-np.eye(2, 4), np.eye(2, 4)])  # takes two states to their offset
 _DRIFTS = np.eye(8)[[2, 3, 6, 7]]  # and to their drifts
-_TINY_M2 = 1e-6  # two sub-maps of one node have no offset
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,7 +96,7 @@ class Offsets:
         both = self._joint[ends[:, :, None], :, ends[:, None, :], :]  # (pairs, end, end, 4, 4)
         both = both.swapaxes(2, 3).reshape(-1, 8, 8)
         covariances_m2 = _BETWEEN @ both @ _BETWEEN.T
-        known = np.linalg.inv(covariances_m2 + _TINY_M2 * np.eye(2))
+        known = np.linalg.inv(covariances_m2 + TINY_M2 * np.eye(2))
         gains = _DRIFTS @ both @ _BETWEEN.T @ known
         told = gains @ covariances_m2 @ gains.swapaxes(1, 2)
         left = _DRIFTS @ both @ _DRIFTS.T - told

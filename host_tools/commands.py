@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from firmware.follower.settings import FollowerSettings
-from host_tools.mission_settings import MissionSettings, changed
+from host_tools.mission_settings import MissionSettings, mission_of
 from host_tools.scenario import load_scenario
 from protocol.errors import ConfigError, FathomError
 
@@ -110,14 +110,14 @@ def settings_of(arguments: argparse.Namespace) -> MissionSettings:
     ConfigError
         For an unknown scenario or key, or a value that cannot be.
     """
-    settings = MissionSettings(scenario=load_scenario(arguments.scenario))
+    scenario = load_scenario(arguments.scenario)
     changes = parse_changes(arguments.changes)
     if arguments.loss is not None:
         changes = {"scenario.water.loss": arguments.loss, **changes}
     if getattr(arguments, "profile", None) is not None:
         is_octree = getattr(arguments, "baseline", None) == "octree"  # rides in paper's packets
         changes = {"follower.profile": "paper" if is_octree else arguments.profile, **changes}
-    settings = changed(settings, changes)
+    settings = mission_of(scenario, changes)
     settings.scenario.check()
     return settings
 

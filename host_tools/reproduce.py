@@ -12,7 +12,7 @@ from tqdm import tqdm
 from host_tools.commands import BASELINES, Command, count, folder_of
 from host_tools.evaluation import Evaluation, as_plain, closure_counts, evaluate
 from host_tools.matching_trial import PAIRS, TrialResult, run_trial, trial_lines
-from host_tools.mission_settings import MissionSettings, changed
+from host_tools.mission_settings import mission_of
 from host_tools.scenario import named_scenario
 from host_tools.simulate import simulate
 from host_tools.simulator.placement import place_survey
@@ -78,9 +78,7 @@ def simulations(
 ) -> Iterable[Outcome]:
     """Yield the outcomes of simulations 1 and 2 under every baseline and seed."""
     for scenario in SCENARIOS:
-        settings = changed(
-            MissionSettings(scenario=named_scenario(scenario)), {"follower.profile": "paper"}
-        )
+        settings = mission_of(named_scenario(scenario), {"follower.profile": "paper"})
         for baseline in BASELINES:
             for seed in seeds:
                 announce(f"{scenario}, {baseline}, seed {seed}")

@@ -37,7 +37,7 @@ class DriftSettings(Settings):
     bias_sigma_mps: float = setting(0.15, "m/s", "unmeasured current at the start", minimum=1e-4)
     bias_walk: float = setting(0.004, "m/s/sqrt(s)", "how the current wanders", minimum=1e-7)
     walk_factor: float = setting(
-        2.0, "1", "by which the walk may well be wrong before answers tell", minimum=1.01
+        4.0, "1", "by which the walk may well be wrong before answers tell", minimum=1.01
     )
     walk_memory_s: float = setting(
         3600.0, "s", "over which what they told of it fades: tides turn", minimum=60.0

@@ -43,7 +43,7 @@ Groups = defaultdict[tuple[int, ...], Group[Kept]]  # by the keys of their nodes
 class CompositionSettings(Settings):
     """How coarse the past becomes, and when."""
 
-    interval_s: float = setting(600.0, "s", "then the solver is built anew, too", minimum=20.0)
+    interval_s: float = setting(300.0, "s", "then the solver is built anew, too", minimum=20.0)
     detail_s: float = setting(
         1200.0, "s", "of full detail; longer than a follower keeps a frame", minimum=900.0
     )

@@ -34,7 +34,7 @@ class GraphSettings(Settings):
         0.004, "m/s/sqrt(s)", "lets a current of 0.2 m/s turn within an hour", minimum=1e-7
     )
     walk_factor: float = setting(
-        2.0, "1", "by which the walk may well be wrong before the mission tells", minimum=1.01
+        4.0, "1", "by which the walk may well be wrong before the mission tells", minimum=1.01
     )
     walk_interval_s: float = setting(
         300.0, "s", "over which drift is compared to learn it: half a survey line", minimum=60.0

@@ -32,7 +32,7 @@ _MOVED = 0.1
 """Metres, m/s or rad from which a variable is linearised anew.
 
 Only directions of ranges and robust weights bend. A compass hardly turns so far: it is taken anew
-when ISAM2 is built, every ten minutes at least.
+when ISAM2 is built, every five minutes at least.
 """
 
 

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from host_tools.mission_settings import MissionSettings
+from host_tools.mission_settings import MissionSettings, mission_of
 from host_tools.scenario import SCENARIOS, load_scenario, named_scenario
 from protocol.errors import ConfigError
 from protocol.settings import replace
@@ -120,3 +120,24 @@ def test_settings_that_are_right_together_may_be_given_in_any_order(
 def test_of_two_names_of_one_setting_the_last_given_counts() -> None:
     settings = replace(MissionSettings(), {"scenario.water.loss": 0.2, "loss": 0.3})
     assert settings.scenario.water.loss == 0.3
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "heading_deg", "log_scale"),
+    [
+        ("paper-1", {}, 0.1, 0.002),
+        ("field-1", {}, 0.5, 0.005),
+        ("paper-1", {"heading_bias_deg": -2.0, "log_scale": -0.01}, 2.0, 0.01),
+        (
+            "field-1",
+            {"heading_bias_sigma_deg": 0.3, "leader.graph.log_scale_sigma": 1e-3},
+            0.3,
+            1e-3,
+        ),
+    ],
+)
+def test_a_leader_is_told_how_good_instruments_are_unless_it_is_set(
+    name: str, changes: dict[str, object], heading_deg: float, log_scale: float
+) -> None:
+    graph = mission_of(named_scenario(name), changes).leader.graph
+    assert (graph.heading_bias_sigma_deg, graph.log_scale_sigma) == (heading_deg, log_scale)

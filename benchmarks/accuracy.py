@@ -97,17 +97,19 @@ def _row(name: str) -> _Row:
 
 
 def table(runs: list[Figures]) -> list[str]:
-    """Return a line a figure: median and worst over the runs that have it."""
-    lines = [f"{'':<42} {'median':>9} {'worst':>9}"]
+    """Return a line a figure: median, worst and mean over the runs that have it."""
+    lines = [f"{'':<42} {'median':>9} {'worst':>9} {'mean':>9}"]
     for name in runs[0]:
         row, values = _row(name), np.array([run[name] for run in runs])
         worst: Callable[[np.ndarray], float] = np.nanmax if row.more_is_worse else np.nanmin
         if np.isnan(values).all():
-            lines.append(f"{name:<42} {'-':>9} {'-':>9}")
+            lines.append(f"{name:<42} {'-':>9} {'-':>9} {'-':>9}")
             continue
         told = np.count_nonzero(np.isfinite(values))
         of = f" ({told} of {len(runs)} seeds)" if told < len(runs) else ""
-        lines.append(f"{name:<42} {np.nanmedian(values):9.2f} {worst(values):9.2f} {row.unit}{of}")
+        three = (np.nanmedian(values), worst(values), np.nanmean(values))
+        columns = " ".join(f"{value:9.2f}" for value in three)
+        lines.append(f"{name:<42} {columns} {row.unit}{of}")
     return lines
 
 

@@ -1,4 +1,4 @@
-"""Accuracy of whole missions over seeds, median and worst.
+"""Accuracy of whole missions over seeds, median, worst and mean.
 
     python -m benchmarks.accuracy --terrain FILE --scenario paper-1 --seeds 5 --set KEY=VALUE
 

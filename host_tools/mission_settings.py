@@ -46,6 +46,7 @@ def changed(settings: MissionSettings, changes: Mapping[str, object]) -> Mission
     """Return the settings with changes by dotted or short key.
 
     The leader is told how uncertain the scenario makes the starts, slots how many followers it has.
+    Nothing is told of compass and log: `mission_of` does.
 
     Raises ConfigError for a key that is unknown or ambiguous, or a value out of bounds.
     """

@@ -12,7 +12,6 @@ from protocol.schedule import Air, SlotSettings, planned_slots
 from protocol.settings import Settings, replace, setting
 
 _REACH_M = 1000.0  # that suggested slots are clear to
-_COMPASS_DEG, _LOG_SCALE = 0.1, 0.002  # a calibrated compass and log, one sigma
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,16 +27,16 @@ class MissionSettings(Settings):
 def mission_of(scenario: ScenarioSettings, changes: Mapping[str, object]) -> MissionSettings:
     """Return a mission of a scenario with changes, which may say otherwise than what follows.
 
-    As data sheets would, the leader is told how large a bias its vehicles' compasses and logs may
-    have, never of which sign: as large as the scenario makes them, and no sheet promises none.
+    The leader is told what the scenario's data sheets say of compass and log, nothing of how these
+    really err.
 
     Raises ConfigError as `changed` does.
     """
     settings = MissionSettings(scenario=scenario)
-    errors = replace(settings, changes, prefer="scenario").scenario
+    sheets = replace(settings, changes, prefer="scenario").scenario
     told = {
-        "leader.graph.heading_bias_sigma_deg": max(abs(errors.heading_bias_deg), _COMPASS_DEG),
-        "leader.graph.log_scale_sigma": max(abs(errors.log_scale), _LOG_SCALE),
+        "leader.graph.heading_bias_sigma_deg": sheets.heading_bias_told_deg,
+        "leader.graph.log_scale_sigma": sheets.log_scale_told,
     }
     return changed(replace(settings, told), changes)
 

@@ -101,8 +101,17 @@ class ScenarioSettings(Settings):
     heading_bias_deg: float = setting(
         0.0, "deg", "in heading and dead reckoning", minimum=-20.0, maximum=20.0
     )
+    heading_bias_told_deg: float = setting(
+        0.1,
+        "deg",
+        "its sigma that the leader is told, as by a data sheet, true or not",
+        minimum=1e-6,
+    )
     log_scale: float = setting(
         0.0, "", "relative error of the speed log", minimum=-0.5, maximum=0.5
+    )
+    log_scale_told: float = setting(
+        0.002, "", "its sigma that the leader is told, as by a data sheet", minimum=1e-9
     )
     current_mps: float = setting(
         0.0, "m/s", "unseen by dead reckoning, the same for all", minimum=0.0, maximum=5.0
@@ -178,7 +187,9 @@ SCENARIOS: dict[str, dict[str, object]] = {
         "sound_speed_error_mps": 2.0,
         "depth_wander_m": 0.3,
         "heading_bias_deg": 0.5,
+        "heading_bias_told_deg": 0.5,
         "log_scale": 0.005,
+        "log_scale_told": 0.005,
         "current_mps": 0.2,
         "flier_share": 0.01,
         "roughness": True,

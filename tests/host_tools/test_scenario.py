@@ -127,7 +127,8 @@ def test_of_two_names_of_one_setting_the_last_given_counts() -> None:
     [
         ("paper-1", {}, 0.1, 0.002),
         ("field-1", {}, 0.5, 0.005),
-        ("paper-1", {"heading_bias_deg": -2.0, "log_scale": -0.01}, 2.0, 0.01),
+        ("paper-1", {"heading_bias_deg": -2.0, "log_scale": 0.01}, 0.1, 0.002),  # nothing of truth
+        ("paper-1", {"heading_bias_told_deg": 2.0, "log_scale_told": 0.01}, 2.0, 0.01),
         (
             "field-1",
             {"heading_bias_sigma_deg": 0.3, "leader.graph.log_scale_sigma": 1e-3},
@@ -136,7 +137,7 @@ def test_of_two_names_of_one_setting_the_last_given_counts() -> None:
         ),
     ],
 )
-def test_a_leader_is_told_how_good_instruments_are_unless_it_is_set(
+def test_a_leader_is_told_what_data_sheets_say_unless_it_is_set(
     name: str, changes: dict[str, object], heading_deg: float, log_scale: float
 ) -> None:
     graph = mission_of(named_scenario(name), changes).leader.graph

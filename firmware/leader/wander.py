@@ -12,8 +12,8 @@ import numpy as np
 
 from firmware.geometry import Array
 
-_REACH = 16.0  # how far from the first belief a walk is looked for, up and down, as a factor
-_GRID = 41
+_REACH = 256.0  # how far from the first belief a walk is looked for, up and down, as a factor
+_GRID = 81
 _TOLD = 0.99  # of the expected variance: what leaves more was told nothing
 
 
@@ -91,8 +91,7 @@ def likely_walk(changes: Sequence[DriftChange], believed: float, factor: float) 
     changes are taken for independent, which neighbours are not quite. The walk's prior is
     log-normal: the factor is its one-sigma spread, the believed walk its root mean square. The
     answer is the root mean square of the posterior, so that little evidence leaves more room for
-    drift rather than less. Walks below a sixteenth of the believed one are not told apart: for
-    still water the answer is up to a fifth too large.
+    drift rather than less.
     """
     walks = believed * np.geomspace(1 / _REACH, _REACH, _GRID)
     spread = np.log(factor)

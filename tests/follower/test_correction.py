@@ -1,18 +1,13 @@
 """What answers teach a follower, and what they must not."""
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from firmware.follower.correction import CorrectionSettings, DriftCorrection
-from firmware.follower.drift_filter import (
-    AnswerSeen,
-    DriftFilter,
-    DriftSettings,
-    DriftState,
-    RangeSeen,
-)
+from firmware.follower.drift_filter import AnswerSeen, DriftFilter, DriftSettings, RangeSeen
 
 BIAS_MPS = np.array([0.1, -0.07])
 
@@ -128,11 +123,11 @@ def test_a_range_teaches_what_draws_of_all_that_is_unsure_say() -> None:
     ranges_m = np.sqrt(slants_m**2 - seen.depth_difference_m**2)
     joint = np.cov(draws.T, ranges_m)
     gain = joint[:6, 6] / joint[6, 6]
-    state = DriftState(
-        time_s=0.0,
-        means=np.tile(mean, (9, 1)),
-        covariances=np.tile(covariance, (9, 1, 1)),
-        log_weights=np.zeros(9),
+    start = DriftFilter(s).deployed(0.0)
+    state = replace(
+        start,
+        means=np.tile(mean, (len(start.means), 1)),
+        covariances=np.tile(covariance, (len(start.means), 1, 1)),
     )
     learned, known = DriftFilter(s).updated(state, seen), np.sqrt(np.diag(covariance))
     expected = mean + gain * (seen.range_m - ranges_m.mean())

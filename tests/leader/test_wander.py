@@ -18,7 +18,7 @@ from firmware.submaps import Track
 from protocol.errors import EstimationError
 
 INTERVAL_S = 300.0
-BELIEVED, FACTOR = 0.004, 2.0
+BELIEVED, FACTOR = GraphSettings().bias_walk, GraphSettings().walk_factor
 
 
 def _changes(
@@ -49,14 +49,15 @@ def test_walk_is_found_whatever_the_estimate_assumed(walk: float, assumed: float
     assert likely_walk(changes, BELIEVED, FACTOR) == pytest.approx(walk, rel=0.3)
 
 
-def test_walk_is_that_of_the_posterior_of_what_was_measured() -> None:
+@pytest.mark.parametrize("size_mps", [0.0, 0.3])
+def test_walk_is_that_of_the_posterior_of_what_was_measured(size_mps: float) -> None:
     """Each change was measured along one axis; it is held against walks by the thousand."""
     rng, expected_m2ps2, spread = np.random.default_rng(8), 0.006**2 * INTERVAL_S, np.log(FACTOR)
     log_walks = np.log(BELIEVED) + np.linspace(-8.0, 8.0, 8001)
     log_likely = -0.5 * ((log_walks - np.log(BELIEVED) + spread**2) / spread) ** 2
     changes = []
     for angle_rad in rng.uniform(0.0, np.pi, 6):
-        measured_mps, noise_mps = 0.3 * rng.standard_normal(), rng.uniform(0.05, 0.15)
+        measured_mps, noise_mps = size_mps * rng.standard_normal(), rng.uniform(0.05, 0.15)
         gain = expected_m2ps2 / (expected_m2ps2 + noise_mps**2)
         axis = np.array([np.cos(angle_rad), np.sin(angle_rad)])
         changes.append(
@@ -96,9 +97,9 @@ def test_without_evidence_the_belief_stays() -> None:
 
 def test_little_evidence_moves_it_little() -> None:
     rng = np.random.default_rng(6)
-    few = likely_walk(_changes(rng, 0.0, BELIEVED, 0.01, 1), BELIEVED, FACTOR)
+    few = likely_walk(_changes(rng, 0.0, BELIEVED, 0.07, 1), BELIEVED, FACTOR)
     many = likely_walk(_changes(rng, 0.0, BELIEVED, 0.01, 50), BELIEVED, FACTOR)
-    assert many < 0.3 * BELIEVED < 0.5 * BELIEVED < few < BELIEVED
+    assert many < 0.1 * BELIEVED < 0.5 * BELIEVED < few < BELIEVED
 
 
 def test_changes_are_between_successive_epochs() -> None:

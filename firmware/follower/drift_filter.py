@@ -47,7 +47,7 @@ class DriftSettings(Settings):
         minimum=1.0,
     )  # fmt: skip
     fresh_share: float = setting(
-        0.4, "1", "of a told sigma that is drawn anew each time", minimum=0.01, maximum=1.0
+        0.2, "1", "of a told sigma that is drawn anew each time", minimum=0.01, maximum=1.0
     )
     range_sigma_m: float = setting(1.5, "m", "noise of one range (Eq. 13) and slant", minimum=0.01)
 

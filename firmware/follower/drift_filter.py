@@ -25,7 +25,7 @@ from protocol.settings import Settings, setting
 
 _WALKS = np.geomspace(1 / 256, 256.0, 17)  # of the believed one, a filter each
 _MOST_TOLD = 5.0  # of walks by one thing seen, in nats
-_BELIEVED = 8  # which of them takes that itself
+_BELIEVED = len(_WALKS) // 2  # which of them takes that itself
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -23,9 +23,9 @@ import numpy as np
 from firmware.geometry import Array
 from protocol.settings import Settings, setting
 
-_WALKS = np.geomspace(1 / 256, 256.0, 17)  # of the believed one, a filter each
+_WALKS = np.geomspace(1 / 256, 16.0, 13)  # a filter each; by wilder ones no lie would be gated
 _MOST_TOLD = 5.0  # of walks by one thing seen, in nats
-_BELIEVED = len(_WALKS) // 2  # which of them takes that itself
+_BELIEVED = 8  # which of them takes about the believed walk
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -114,9 +114,10 @@ class DriftFilter:
 
     def __init__(self, settings: DriftSettings) -> None:
         self._settings = settings
-        self._walks = settings.bias_walk * _WALKS
         spread = np.log(settings.walk_factor)
         self._log_prior = -0.5 * (np.log(_WALKS) / spread + spread) ** 2
+        mean_square = np.average(_WALKS**2, weights=np.exp(self._log_prior))
+        self._walks = settings.bias_walk * _WALKS / np.sqrt(mean_square)
 
     def deployed(self, time_s: float) -> DriftState:
         """Return what is known at a start; a later one than the mission's has drifted since.

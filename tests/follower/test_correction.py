@@ -78,6 +78,25 @@ def test_still_water_that_begins_to_turn_is_noticed() -> None:
     assert alone_sigma_m(still, 8970.0 + 2400.0 + 630.0) > 2.5 * before_m
 
 
+def test_prior_of_walks_has_the_believed_one_for_its_root_mean_square() -> None:
+    settings = DriftSettings()
+    drift = DriftFilter(settings)
+    _, covariance = drift.predicted(drift.deployed(0.0), 3600.0).blended()
+    alone_m2 = settings.start_sigma_m**2 + settings.odometry_noise**2 * 3600.0
+    alone_m2 += (settings.bias_sigma_mps * 3600.0) ** 2 + settings.bias_walk**2 * 3600.0**3 / 3
+    assert covariance[0, 0] == pytest.approx(alone_m2, rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_answers_that_claim_to_be_surer_than_they_are_do_not_open_the_gate(seed: int) -> None:
+    """They err by four of their sigmas, and anew each time; then one is 300 m off."""
+    rng, correction = np.random.default_rng(seed), DriftCorrection(0.0, CorrectionSettings())
+    for time_s in np.arange(10.0, 2301.0, 10.0):
+        said_m = 4.0 * rng.standard_normal(2)
+        correction.receive_answer(float(time_s), np.zeros(2), said_m, sigma_m=1.0)
+    assert not correction.receive_answer(2400.0, np.zeros(2), np.array([300.0, 0.0]), sigma_m=1.0)
+
+
 def test_what_was_learned_of_a_walk_fades() -> None:
     drift = DriftFilter(DriftSettings())
     state = first = drift.deployed(0.0)

@@ -136,8 +136,16 @@ class DriftCorrection:
         slant_m: float,
         depth_difference_m: float,
     ) -> bool:
-        """Learn from the range to the leader; return whether it was believed."""
+        """Learn from the range to the leader; return whether it was believed.
+
+        One heard while the motion is unknown counts for the newest instant of which that was told,
+        give or take what the vehicle may have moved since.
+        """
         s = self._settings
+        begun_s, told_s = self._losing_s
+        if begun_s < time_s < told_s:
+            unseen_m = LOST_SIGMA_MPS * (told_s - time_s)
+            time_s, leader_sigma_m = told_s, float(np.hypot(leader_sigma_m, unseen_m))
         range_m = horizontal_m(slant_m, depth_difference_m)
         numbers = [time_s, *reckoned_m, *leader_m, leader_sigma_m, range_m]
         sane = bool(np.isfinite(numbers).all()) and time_s >= self._base.time_s

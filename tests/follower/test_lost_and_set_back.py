@@ -19,6 +19,7 @@ def test_a_range_heard_while_navigation_is_lost_is_held_against_the_doubt_so_far
             correction.receive_range(450.0, drift_m(400.0), leader_m, 1.0, range_m, 0.0)
     state = correction._seen[-1].state
     mean, covariance = state.blended()
+    assert correction.ranges_accepted == 1
     assert np.abs(mean[2:4] - BIAS_MPS).max() < 3.0 * np.sqrt(covariance[2, 2])
     assert covariance[0, 0] > 250.0**2 * 0.5
 

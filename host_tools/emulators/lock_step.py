@@ -14,7 +14,7 @@ from protocol.modems.dialect_driver import DialectDriver
 from protocol.modems.registry import open_modem
 
 STEP_S = 0.02
-"""Of virtual time: a vehicle's loop polls its modem this often."""
+"""Of virtual time: the bench polls its modems this often, and a vehicle's loop ten times less."""
 HANDOVER_S = 1.0
 """Of real time: a kernel that takes longer is not going to."""
 
@@ -23,9 +23,13 @@ class LockStep:
     """An emulation, and a driver on each of its ports (or on the URLs that are given)."""
 
     def __init__(
-        self, emulation: Emulation, urls: list[str] | None = None, tap: Tap | None = None
+        self,
+        emulation: Emulation,
+        urls: list[str] | None = None,
+        tap: Tap | None = None,
+        step_s: float = STEP_S,
     ) -> None:
-        self.emulation, self.now_s = emulation, 0.0
+        self.emulation, self.now_s, self.step_s = emulation, 0.0, step_s
         self.drivers: list[DialectDriver] = []
         urls = urls or emulation.urls()
         self._spoken = [0 for _ in urls]
@@ -44,7 +48,7 @@ class LockStep:
 
     def step_water(self) -> None:
         """Let one step pass at the modems, until its bytes can be read."""
-        self.now_s += STEP_S
+        self.now_s += self.step_s
         ports = list(self.emulation.ports.values())
         wanted = [port.waiting_bytes()[0] - port.written_bytes for port in ports]
         self.emulation.step(self.now_s)

@@ -164,7 +164,7 @@ class DialectDriver:
         if self._port.is_open:
             due = self.core.next_wakeup_s(now_s) <= now_s
             output = self.core.poll(now_s)
-            if due or output:
+            if due or output or self.core.outbox:  # what waits is planned by when polls come
                 self._report("poll", b"", now_s)
             output += self._identification.poll(now_s, identified=self.core.identified)
             self._port.write(output, now_s)

@@ -1,7 +1,8 @@
 """Every byte of a modem's line in a file, and a run of the same core over that file again.
 
 One JSON object per line: t (now_s), way and hex. `in` and `out` are bytes of the line, `send` is a
-frame that was queued, `poll` a moment at which the core had something to do, `lost` a port gone.
+frame that was queued, `poll` a moment at which the core had something to do or to wait for, `lost`
+a port gone.
 """
 
 import json
@@ -84,6 +85,7 @@ def replay(lines: Iterable[LogLine], core: Core) -> tuple[list[DialectEvent], by
             case "send":
                 core.send(line.data, line.t_s)
             case "poll":
+                core.next_wakeup_s(line.t_s)  # as its driver asks, which plans what waits
                 said += core.poll(line.t_s)
             case "lost":
                 core.lost(line.t_s)

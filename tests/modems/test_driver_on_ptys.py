@@ -207,16 +207,18 @@ def test_port_pulled_and_modem_power_cycled_a_hundred_times(kind: str, tmp_path:
         assert both.drivers[0].status().reopened == 50
 
 
-def test_a_raw_log_replays_to_the_same_words_and_events(tmp_path: Path) -> None:
+@pytest.mark.parametrize("step_s", [0.02, 0.25])
+def test_a_raw_log_replays_to_the_same_words_and_events(step_s: float, tmp_path: Path) -> None:
     file = io.StringIO()
     units = {n: MicroModemUnit(n, MicroModemQuirks(forgets_settings=True)) for n in (1, 2)}
-    with pair("micromodem", tmp_path, tap=RawLog(file), units=dict(units)) as both:
+    tap = RawLog(file)
+    with pair("micromodem", tmp_path, tap=tap, units=dict(units), step_s=step_s) as both:
         both.run(10.0)
         for n in range(4):
             both.drivers[0].send(bytes([n]) * 200, both.now_s)
         both.run(2.0)
         units[1].power_cycle(both.now_s)
-        both.run(20.0)
+        both.run(40.0)
         both.drivers[1].send(b"hello", both.now_s)
         both.run(10.0)
         heard = both.frames(0)

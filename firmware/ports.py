@@ -54,7 +54,7 @@ class SensorPort:
                 self._keep(_MOST_AHEAD)
                 return
             is_near = not _is_after(step, now_s + _FAR_AHEAD_S)
-            if is_near:
+            if is_near and math.isfinite(step[0].time_s):  # no time says nothing of others
                 self._keep(0)
             self._waiting.append(step)
             if is_near:

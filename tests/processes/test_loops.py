@@ -109,6 +109,15 @@ def test_steps_read_in_advance_are_not_lost_while_a_clock_is_set_back() -> None:
     assert not port.counters
 
 
+def test_a_step_without_a_time_costs_none_of_those_before_it() -> None:
+    stamps_s = [0.0, 5.0, 5.5, np.nan, 6.0]
+    port, core = SensorPort((odometry(time_s), None) for time_s in stamps_s), Notebook()
+    for quarter in range(40):
+        port.feed(core, quarter / 4)
+    assert np.array_equal(core.times_s, stamps_s, equal_nan=True)
+    assert not port.counters
+
+
 def test_what_goes_wrong_in_one_task_does_not_stop_the_others(
     caplog: pytest.LogCaptureFixture,
 ) -> None:

@@ -121,6 +121,7 @@ TABLE: dict[tuple[State, str], Row] = {
     (State.FLEXIBLE_ASKED, "refused"): ("refuse_flexible", State.IDLE),
     (State.LOADED, "CADRQ"): ("load_nothing", State.LOADED),
     (State.LOADED, "CATXP"): ("note_start", State.SENDING),
+    (State.LOADED, "CATXF"): ("note_sent", State.IDLE),
     (State.LOADED, "refused"): ("refuse_packet", State.IDLE),
     (State.SENDING, "CATXF"): ("note_sent", State.IDLE),
     (State.SENDING, "refused"): ("refuse_packet", State.IDLE),

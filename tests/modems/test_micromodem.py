@@ -314,6 +314,19 @@ def test_a_host_too_late_for_the_data_request_tries_again() -> None:
     assert frames_of(rig, 2) == [bytes(256)]
 
 
+def test_a_packet_whose_beginning_is_unread_goes_out_once() -> None:
+    rig = micro_rig(settings=MicroModemSettings(flexible=False))
+    core = core_of(rig, 1)
+    receive = core.receive_data
+    core.receive_data = lambda data, now_s: receive(  # type: ignore[method-assign]
+        data.replace(b"$CATXP", b"$CAT\xd8P"), now_s
+    )
+    core.send(bytes(200), rig.now_s, 20.0)
+    rig.run_until(60.0)
+    assert [e.start_s for e in rig.taken(1, FrameSent) if isinstance(e, FrameSent)] == [20.0]
+    assert frames_of(rig, 2) == [bytes(200)]
+
+
 def test_a_full_queue_drops_the_oldest_and_says_so() -> None:
     core = MicroModem(MicroModemSettings(queue_frames=4))
     for n in range(7):

@@ -146,8 +146,8 @@ class Traffic(Setup):
 
     def load_frame(self, sentence: Sentence, now_s: float) -> str | None:
         """Answer a data request with its frame."""
-        number = integer(sentence.fields[5], 0) if len(sentence.fields) >= 6 else 0
-        if not number or integer(sentence.fields[1]) != self.settings.address:
+        number = integer(sentence.fields[5]) if len(sentence.fields) >= 6 else None
+        if number is None or number < 1 or integer(sentence.fields[1]) != self.settings.address:
             return None
         if number > len(self.outbox.lent):
             self.load_nothing(sentence, now_s)

@@ -115,6 +115,20 @@ def test_undecodable_bytes_in_every_state_neither_kill_nor_hang_the_driver(
     pass_one_frame(rig)
 
 
+@pytest.mark.parametrize("number", ["", "x", 0, -1, 3, 999999])
+def test_a_data_request_for_no_frame_of_ours_harms_nothing(number: str | int) -> None:
+    rig = micro_rig(settings=MicroModemSettings(flexible=False))
+    core = rig.cores[1]
+    assert isinstance(core, MicroModem)
+    core.send(b"x" * 200, rig.now_s)
+    while core.state is not State.CYCLE_ASKED:
+        rig.run_until(rig.now_s + 0.02)
+    core.receive_data(nmea.encode("CADRQ", "000000", 1, 2, 0, 256, number), rig.now_s)
+    rig.run_until(rig.now_s + 30.0)
+    assert b"x" * 200 in frames_of(rig, 2)
+    pass_one_frame(rig)
+
+
 def test_a_configuration_dump_without_end_and_with_a_heartbeat_in_it_ends() -> None:
     """Goby3 issue 126."""
     rig = micro_rig(quirks=MicroModemQuirks(heartbeat_in_dump=True))

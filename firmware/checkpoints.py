@@ -20,22 +20,9 @@ _OTHERS = {
 }
 
 
-class NotNowError(Exception):
-    """The core is in the middle of work that cannot be written down."""
-
-
 def written(whole: object, marks: tuple[object, ...]) -> bytes:
-    """Return a core, or what matches found, and marks as bytes; numbers read back exactly.
-
-    Raises
-    ------
-    NotNowError
-        While a core holds an iterator, such as a fit at work.
-    """
-    try:
-        return pickle.dumps((whole, marks), protocol=5)
-    except TypeError as error:
-        raise NotNowError(str(error)) from error
+    """Return a core, or what matches found, and marks as bytes; numbers read back exactly."""
+    return pickle.dumps((whole, marks), protocol=5)
 
 
 def read(body: bytes, kind: type[T]) -> tuple[T, tuple[Any, ...]]:

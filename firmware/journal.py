@@ -40,7 +40,10 @@ class JournalSettings(Settings):
         1.0, "s", "navigation lost at worst; a commit is one sync of the disk", minimum=0.0
     )
     checkpoint_s: float = setting(
-        60.0, "s", "what a follower measures again after a restart", minimum=1.0
+        60.0,
+        "s",
+        "between checkpoints of a follower: a restart replays what came since",
+        minimum=1.0,
     )
     waiting_bytes: int = setting(
         4_000_000, "bytes", "kept for a disk that is full: twenty minutes of pings", minimum=1000

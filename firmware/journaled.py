@@ -102,7 +102,7 @@ class Journaled(Generic[Core_co]):
         raise StoreUnusableError(f"this vehicle has no input of kind {kind}")
 
     def _checkpoint(self) -> None:
-        """Write the core down; raise NotNowError while it cannot be."""
+        """Write the core down."""
         self.recorder.journal.checkpoint(written(self.core, self.recorder.marks()))
 
 

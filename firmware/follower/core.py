@@ -2,13 +2,11 @@
 
 import dataclasses
 from collections import Counter, deque
-from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from firmware.belief import Belief
-from firmware.compression import Compressed, compress_steps, packets_from
+from firmware.compression import packets_from
 from firmware.compression.packing import submap_header
 from firmware.compression.results import PAPER_FRAGMENTS
 from firmware.compression.settings import CompressionSettings
@@ -16,32 +14,19 @@ from firmware.dead_reckoning import DeadReckoning, ReckonedState
 from firmware.follower.correction import DriftCorrection
 from firmware.follower.outbox import Outbox
 from firmware.follower.settings import FollowerSettings
+from firmware.follower.submap_fit import SubmapFit
 from firmware.geometry import Array
 from firmware.soundings import Odometry, Ping
 from firmware.submap_builder import SubmapBuilder, track_of
 from firmware.submaps import Submap, Track
 from protocol.codec import decode, encode
-from protocol.errors import (
-    ConfigError,
-    EstimationError,
-    LocalProtocolError,
-    RemoteProtocolError,
-)
+from protocol.errors import ConfigError, LocalProtocolError, RemoteProtocolError
 from protocol.packets import SIZE_BYTES, Answer, ExtendedAnswer, SealedFrame
 from protocol.schedule import Slots, Turns
 from protocol.timestamps import from_quarters, is_arrival, to_quarters, transmission_s
 from protocol.vehicles import BOOT_EPOCHS, LEADER
 
 _IDLE_STATES = 20  # as many as a trajectory packet holds
-
-
-@dataclass(slots=True)
-class _Fit:
-    """A sub-map under compression: the steps still to do, and the best result so far."""
-
-    submap: Submap
-    steps: Iterator[Compressed]
-    best: Compressed | None = None
 
 
 class FollowerCore:
@@ -72,7 +57,7 @@ class FollowerCore:
         )
         self._track: deque[ReckonedState] = deque(maxlen=int(settings.track_s))
         self._is_lost = False
-        self._fit: _Fit | None = None
+        self._fit: SubmapFit | None = None
         self._compression = _fitting(settings, slots)
         self._outbox = Outbox(
             vehicle, boot_epoch, settings.repeats, small_frames=self._compression.small_frames
@@ -132,14 +117,9 @@ class FollowerCore:
         if self._fit is None:
             return
         for _ in range(self._settings.steps_per_tick):
-            try:
-                step = next(self._fit.steps, None)
-            except EstimationError:
-                step = None
-            if step is None:
+            if not self._fit.step():
                 self._end_fit()
                 return
-            self._fit.best = step
 
     def poll(self, now_s: float) -> bytes | None:
         """Return a frame to transmit now, or None: one a call, as many a slot as it holds."""
@@ -196,7 +176,7 @@ class FollowerCore:
         """Forget the times that are yet to come: the clock was set back."""
         while self._track and self._track[-1].time_s > to_s:
             self._track.pop()
-            self._last_submap_s = min(self._last_submap_s, to_s)
+        self._last_submap_s = min(self._last_submap_s, to_s)
         self._correction.set_back(from_s, to_s)
 
     def _begin_boot(self) -> None:
@@ -215,8 +195,7 @@ class FollowerCore:
             self.counters["fits_cut_short"] += 1
             self._end_fit()
         self._last_submap_s = float(submap.track.time_s[-1])
-        steps = compress_steps(submap.bins, self._compression, self._settings.profile)
-        self._fit = _Fit(submap=submap, steps=steps)
+        self._fit = SubmapFit(submap, self._compression, self._settings.profile)
 
     def _end_fit(self) -> None:
         fit, self._fit = self._fit, None

@@ -1,8 +1,7 @@
-"""A follower behind its journal: it writes itself down once a minute, when no fit is at work."""
+"""A follower behind its journal: it writes itself down once a minute."""
 
 import math
 
-from firmware.checkpoints import NotNowError
 from firmware.dead_reckoning import ReckonedState
 from firmware.follower.core import FollowerCore
 from firmware.follower.settings import FollowerSettings
@@ -35,15 +34,11 @@ class JournaledFollower(Journaled[FollowerCore]):
         self._checkpointed_s = -math.inf if journal.is_resumed else start.time_s
 
     def tick(self, now_s: float) -> None:
-        """Record and work; write the core down when it is time and no fit is at work."""
+        """Record and work; write the core down when it is time."""
         super().tick(now_s)
-        every_s = self.recorder.journal.settings.checkpoint_s
-        if abs(now_s - self._checkpointed_s) >= every_s:
+        if abs(now_s - self._checkpointed_s) >= self.recorder.journal.settings.checkpoint_s:
             self._checkpointed_s = now_s
-            try:
-                self._checkpoint()
-            except NotNowError:
-                self._checkpointed_s -= every_s - 1.0  # again in a second
+            self._checkpoint()
 
     def poll(self, now_s: float) -> bytes | None:
         """Return the frame to transmit now, or None; what led to it, its epoch too, is on disk."""

@@ -8,7 +8,7 @@ replayed; ISAM2, which is not written, has just been built from the ledger, and 
 import logging
 
 from firmware.belief import Belief
-from firmware.checkpoints import NotNowError, read, written
+from firmware.checkpoints import read, written
 from firmware.dead_reckoning import ReckonedState
 from firmware.inputs import Kind
 from firmware.journal import Journal
@@ -47,10 +47,7 @@ class JournaledLeader(Journaled[LeaderCore]):
         before_s = self.core.composed_s
         super().tick(now_s)
         if self.core.composed_s != before_s:
-            try:
-                self._checkpoint()
-            except NotNowError:
-                self.recorder.journal.counters["store_checkpoints_put_off"] += 1
+            self._checkpoint()
 
     def next_jobs(self) -> SheetJobs | None:
         """Return the matches that wait; first those that a kill has cut short."""

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from firmware.checkpoints import NotNowError, read, written
+from firmware.checkpoints import read, written
 from firmware.follower.journaled import JournaledFollower
 from firmware.journal import Journal, JournalSettings, Owner
 from firmware.store_file import StoreUnusableError
@@ -32,11 +32,6 @@ def test_plain_values_read_back() -> None:
     np.testing.assert_array_equal(back.pop("array"), state.pop("array"))
     np.testing.assert_array_equal(back.pop("odd"), state.pop("odd"))
     assert back == state
-
-
-def test_work_in_progress_is_not_now() -> None:
-    with pytest.raises(NotNowError):
-        written({"fit": (k for k in range(3))}, ())
 
 
 class Call:
@@ -78,17 +73,21 @@ def test_junk_is_no_checkpoint(junk: bytes) -> None:
         read(junk, object)
 
 
+@pytest.mark.parametrize(("checkpoint_s", "steps_per_tick"), [(60.0, 50), (45.0, 1)])
 @pytest.mark.parametrize("profile", ["paper", "dense", "lattice"])
 def test_follower_of_every_profile_resumes_from_its_checkpoint(
-    tmp_path: Path, profile: str
+    tmp_path: Path, profile: str, checkpoint_s: float, steps_per_tick: int
 ) -> None:
-    changes = {"duration_min": 2.0, "follower_duration_min": 2.0, "leg_m": 60.0, "beams": 24}
-    settings = changed(MissionSettings(), {**changes, "follower.profile": profile})
+    """The sub-map ended at 40 s; its fit is done by the checkpoint, or goes on after it."""
+    short = {"duration_min": 2.0, "follower_duration_min": 2.0, "leg_m": 60.0, "beams": 24}
+    fit = {"follower.profile": profile, "follower.steps_per_tick": steps_per_tick}
+    settings = changed(MissionSettings(), {**short, **fit})
     site = place_survey(open_terrain(None, 1), settings.scenario, 4)
     vehicle = simulated_vehicles(settings, site, 4)[1]
 
     def follower() -> JournaledFollower:
-        journal = Journal(tmp_path, Owner(vehicle=1, fingerprint=""), JournalSettings())
+        how = JournalSettings(checkpoint_s=checkpoint_s)
+        journal = Journal(tmp_path, Owner(vehicle=1, fingerprint=""), how)
         slots, start = Slots(settings.slots), deployed(vehicle)
         return JournaledFollower(journal, 1, start, settings=settings.follower, slots=slots)
 
@@ -96,6 +95,8 @@ def test_follower_of_every_profile_resumes_from_its_checkpoint(
     for odometry, ping in vehicle.steps():
         if odometry.time_s > 75.0:
             break
+        if odometry.time_s == checkpoint_s:
+            assert (first.core._fit is not None) == (steps_per_tick == 1)
         first.receive_odometry(odometry)
         if ping is not None:
             first.receive_ping(ping)

@@ -110,10 +110,10 @@ class Header:
     time, modulo 2**20 (72.8 h), see `protocol.timestamps`.
 
     In fragments of a sub-map, submap, fragment (from 0) and fragment_count say which part of what
-    this is, and time_quarters is the time of the slice's first state. In a trajectory packet,
-    submap counts such packets and fragment_count is 1. In an answer, submap holds the code of its
-    sigma and a count (see `answer_count`), fragment is the vehicle addressed and fragment_count the
-    boot epoch of the sub-map answered.
+    this is, and time_quarters is the time of the body's first state. In a trajectory packet, submap
+    counts such packets and fragment_count is 1. In an answer, submap holds the code of its sigma
+    and a count (see `answer_count`), in an extended one just a count; fragment is the vehicle
+    addressed and fragment_count the boot epoch of the sub-map answered.
     """
 
     profile: Profile

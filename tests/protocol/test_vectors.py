@@ -1,6 +1,8 @@
 """The golden vectors are the contract: this decoder, and the files, agree with them."""
 
 import json
+import re
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +88,12 @@ def test_wire_md_names_the_fingerprint_of_this_version() -> None:
 def test_wire_md_lists_every_profile_with_its_sizes(profile: Profile) -> None:
     sizes = f"{SIZE_BYTES[profile]} | {BODY_BYTES[profile]}"
     assert f"| {int(profile)} | `{profile.name}` | {sizes} |" in WIRE
+
+
+def test_wire_md_tells_the_sizes_of_its_structures() -> None:
+    told = re.findall(r"Struct (>\w+) \((\d+) bytes\)", WIRE)
+    assert len(told) == 2
+    assert [int(size) for _, size in told] == [struct.calcsize(layout) for layout, _ in told]
 
 
 def test_wire_md_names_every_field() -> None:

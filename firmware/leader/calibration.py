@@ -107,7 +107,7 @@ class Calibration:
         if self._time_s is not None:
             kept = float(np.exp(-max(now_s - self._time_s, 0.0) / self._settings.memory_s))
             self._information, self._vector = self._information * kept, self._vector * kept
-        self._time_s = now_s
+        self._time_s = now_s if self._time_s is None else max(now_s, self._time_s)
         self._information = self._information + found.information
         self._vector = self._vector + found.vector
         return True

@@ -89,6 +89,18 @@ def test_evidence_fades_with_the_water(scene: Scene) -> None:
     assert spread[1] < 0.8 * spread[0]
 
 
+def test_evidence_fades_once_whatever_comes_late(scene: Scene) -> None:
+    pair = overlap(scene, 60.0, 3.0)
+    early, late = (Calibration(CalibrationSettings(memory_s=600.0)) for _ in range(2))
+    for now_s in (0.0, 600.0, 600.0):
+        early.learn(pair, NOISE, now_s)
+    for now_s in (0.0, 600.0, 0.0):
+        late.learn(pair, NOISE, now_s)
+    for calibration in (early, late):
+        calibration.learn(pair, NOISE, 600.0)
+    assert late.covariance == pytest.approx(early.covariance)
+
+
 def test_cells_seen_from_several_headings_are_not_pure(scene: Scene) -> None:
     grid, track = line(scene, 300.0, northward=True)
     assert swath_of(grid, track, STILL, 20.0).pure.all()

@@ -223,7 +223,7 @@ def _axes(position_m: Array, settings: ReconstructionSettings) -> tuple[Array, A
     cell_m = settings.cell_m
     low, high = position_m.min(axis=0), position_m.max(axis=0)
     sides = np.floor(high / cell_m) - np.ceil(low / cell_m) + 1
-    if sides[0] * sides[1] > settings.max_cells:
+    if max(sides) > np.sqrt(settings.max_cells):
         reach_m = 0.5 * cell_m * (np.sqrt(settings.max_cells) - 2.0)
         middle = np.median(position_m, axis=0)
         low, high = np.maximum(low, middle - reach_m), np.minimum(high, middle + reach_m)

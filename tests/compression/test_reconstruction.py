@@ -64,6 +64,13 @@ def test_points_far_away_do_not_make_the_grid_grow(far_m: float) -> None:
     assert grid.depth_m.size <= 20_000
 
 
+def test_points_in_a_strip_make_no_long_grid() -> None:
+    strip = np.array([[1e4 * k, 0.5 * (k % 2), 40.0] for k in range(75)])
+    bounds = ReconstructionSettings(cell_m=1.0)
+    grid = reconstruct_points(strip, np.array([-0.1, 0.01, 0.01, 40.0]), TRACK, bounds)
+    assert max(grid.depth_m.shape) <= 1000
+
+
 def test_points_on_a_line_are_told() -> None:
     points = np.column_stack([np.arange(20.0), np.arange(20.0), np.full(20, 40.0)])
     with pytest.raises(EstimationError, match="line"):

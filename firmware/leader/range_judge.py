@@ -23,6 +23,7 @@ _WILD_DENSITY = 1e-4  # per metre: multipath from anywhere in the water column
 _GRID_STEP_SIGMAS = 0.5
 _SPREAD_OVER_S = 20.0
 _SHARES = np.array([0.05, 0.2, 0.4, 0.6, 0.8, 0.95])
+_CHANGED = 0.003  # how often a window's share is new: more leaves more of them undecided
 _SELDOM, _SELDOM_SHARE = 3.0, 0.1  # times the usual rate, and how often: some drift runs away
 _LONGEST_GRID = 1000  # half-widths: a kilometre of miss at the usual sigma
 
@@ -172,11 +173,13 @@ class RangeJudge:
     def _log_likelihood(self, as_true: Array, as_stretched: Array) -> Array:
         """Return the log likelihood (G, V) of all ranges over every share that may be the true one.
 
-        The share is as uncertain as what was seen so far leaves it: a beta distribution. The
-        product of the densities of all that may be joined is no less than 1e-240: a double.
+        The share is as uncertain as what was seen so far leaves it: a beta distribution, or any
+        now and then, since hours of few outliers do not tell that the next are few. The product of
+        the densities of all that may be joined is no less than 1e-240: a double.
         """
         exponents = self._seen["stretched"] - 1.0, self._seen["true"] - 1.0
         weights = softmax(exponents[0] * np.log(_SHARES) + exponents[1] * np.log(1.0 - _SHARES))
+        weights = (1.0 - _CHANGED) * weights + _CHANGED / len(_SHARES)
         likelihood = sum(
             weight * np.prod((1.0 - share) * as_true + share * as_stretched + _WILD_DENSITY, axis=0)
             for share, weight in zip(_SHARES, weights, strict=True)

@@ -8,7 +8,9 @@ restart counts as another boot of the same epoch.
 """
 
 from collections import Counter, deque
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +30,8 @@ _HELD_M = 1.0  # dead reckoning that stands still was held while navigation was 
 _CONTINUES_M = 3.0  # dead reckoning that goes on lies this near to a straight continuation
 _MOST_BOOTS = 20  # of a vehicle within an hour: two senders of one number begin one by every frame
 _HOUR_S = 3600.0
+
+Timed = TypeVar("Timed", Track, Trajectory)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,11 +104,13 @@ class Fleet:
         """
         newest = self._followers[header.vehicle].boot
         ahead = (header.boot_epoch - newest) % BOOT_EPOCHS
-        earlier = newest + ahead - BOOT_EPOCHS
-        is_likely = ahead >= BOOT_EPOCHS // 2 or chain_of(header.vehicle, earlier) in self._tracks
-        if ahead and earlier >= 0 and is_likely and self._is_late(header, earlier):
-            return earlier
-        return newest + ahead
+        if ahead == 0:
+            return newest
+        turns = range(newest + ahead - BOOT_EPOCHS, -1, -BOOT_EPOCHS)
+        likely = turns[:1] if ahead >= BOOT_EPOCHS // 2 else ()
+        heard = [boot for boot in turns if chain_of(header.vehicle, boot) in self._tracks]
+        late = (boot for boot in (*heard, *likely) if self._is_late(header, boot))
+        return next(late, newest + ahead)
 
     def chain(self, header: Header) -> int:
         """Return the number of the chain that a frame's states belong to."""
@@ -157,12 +163,13 @@ class Fleet:
         return self._tracks[chain].track()
 
     def whole_track(self, vehicle: int) -> Track:
-        """Return the tracks of all of a vehicle's boots, one after the other."""
-        return concatenated([self.track(chain) for chain in self._chains(vehicle)])
+        """Return the tracks of all of a vehicle's boots, each up to where the next begins."""
+        return concatenated(_in_turn([self.track(chain) for chain in self._chains(vehicle)]))
 
     def whole_trajectory(self, vehicle: int) -> Trajectory:
-        """Return the estimate over all of a vehicle's boots."""
-        return concatenated([self._graph.trajectory(chain) for chain in self._chains(vehicle)])
+        """Return the estimate over all of a vehicle's boots, each up to where the next begins."""
+        chains = self._chains(vehicle)
+        return concatenated(_in_turn([self._graph.trajectory(chain) for chain in chains]))
 
     def chain_at(self, vehicle: int, time_s: float) -> int:
         """Return the chain of a vehicle that the time belongs to."""
@@ -256,3 +263,13 @@ class Fleet:
         self._graph.add_boot(
             chain, time_s, start_m, after=before, reached_m=reached_m, sigma_m=sigma_m
         )
+
+
+def _in_turn(parts: Sequence[Timed]) -> list[Timed]:
+    """Return values of ascending times, each up to where the next begins: clocks are set back."""
+    ends_s = [*(part.time_s[0] for part in parts[1:]), np.inf]
+    rows = [slice(int(np.searchsorted(p.time_s, e))) for p, e in zip(parts, ends_s, strict=True)]
+    return [
+        replace(part, **{f.name: getattr(part, f.name)[r] for f in fields(part)})
+        for part, r in zip(parts, rows, strict=True)
+    ]

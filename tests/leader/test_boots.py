@@ -155,6 +155,38 @@ def test_late_frame_of_a_boot_never_heard_does_not_start_another() -> None:
     assert leader.track(1).time_s == pytest.approx([*range(20, 40), *range(60, 100)])
 
 
+def test_late_frame_of_an_earlier_boot_is_known_after_a_lasting_jump() -> None:
+    leader = sailed(40.0)
+    for time_s in range(41, 400):
+        leader.fleet.own.add(float(time_s), 2.0 * time_s, 0.0, 0.0)
+    jumped = [(5, 140.0 + 20.0 * k, 5000.0 + 40.0 * k, 220.0) for k in range(3)]
+    for boot, first_s, north_m, now_s in (
+        *((4, 40.0, 80.0, 100.0), (4, 60.0, 120.0, 100.0)),
+        *((5, 100.0, 200.0, 150.0), (5, 120.0, 240.0, 150.0)),
+        *(*jumped, (4, 80.0, 160.0, 225.0)),
+    ):
+        frame = changed(trajectory(walked(20, north_m), first_s), boot_epoch=boot)
+        leader.receive_frame(frame, None, now_s)
+    assert leader.status()["lasting_jumps"] == 1
+    assert len(leader.graph.chains()) == 4
+    assert leader.fleet.track(leader.graph.chains()[1]).time_s == pytest.approx(np.arange(40, 100))
+
+
+def test_late_frame_of_a_boot_never_heard_founds_none_among_many() -> None:
+    leader = sailed(40.0)
+    for time_s in range(41, 900):
+        leader.fleet.own.add(float(time_s), 2.0 * time_s, 0.0, 0.0)
+    boots = [*range(3, 19), 20]
+    for k, boot in enumerate(boots):
+        frame = changed(trajectory(walked(20, 800.0 * k), 40.0 * k), boot_epoch=boot % 16)
+        leader.receive_frame(frame, None, 40.0 * k + 30.0)
+    late = changed(trajectory(walked(20, 9000.0), 40.0 * 15 + 20.0), boot_epoch=19 % 16)
+    leader.receive_frame(late, None, 700.0)
+    frame = changed(trajectory(walked(20, 800.0 * 16 + 40.0), 660.0), boot_epoch=20 % 16)
+    leader.receive_frame(frame, None, 700.0)
+    assert leader.status()["restarts"] == len(boots) - 1
+
+
 def test_trajectory_that_jumps_for_a_moment_loses_those_states_alone() -> None:
     leader = sailed()
     states = walked(20, 0.0)
@@ -216,6 +248,8 @@ def test_track_after_a_clock_was_set_back_is_where_it_was_or_the_tie_says_so(jum
         states = walked(20, 2.0 * first_s + jump_m * (first_s >= 600))
         leader.receive_frame(trajectory(states, theirs_s), None, first_s + 40.0)
     assert leader.status()["lasting_jumps"] == 1
+    for whole in (leader.track(1), leader.trajectory(1)):
+        assert np.all(np.diff(whole.time_s) > 0.0)
     newest, graph = leader.fleet.newest_chain(1), leader.graph
     track = leader.fleet.track(newest)
     begun_s, true_m = float(track.time_s[0]), np.array([track.north_m[0] - jump_m, 0.0])

@@ -12,7 +12,7 @@ from firmware.dead_reckoning import LOST_SIGMA_MPS
 from firmware.geometry import Array
 from firmware.leader.ledger import OdometryRecord, SharedWalkRecord
 from firmware.leader.trajectory import Trajectory
-from firmware.leader.wander import reckoned_m2
+from firmware.leader.wander import bridged_m2
 
 _MOST_SPANS = 1024  # of lost navigation; of more the two nearest become one, with what is between
 
@@ -133,7 +133,7 @@ class Chain:
     ) -> OdometryRecord:
         """Return dead reckoning between two nodes by their index."""
         interval_s = self.times_s[after] - self.times_s[before]
-        variance_m2 = reckoned_m2(interval_s, odometry_noise, bias_walk)
+        variance_m2 = bridged_m2(interval_s, odometry_noise, bias_walk)
         variance_m2 += self.lost_m2(self.times_s[before], self.times_s[after])
         return OdometryRecord(
             origin=self.keys[before],

@@ -62,8 +62,8 @@ def _robust(covariance: Array, robust_kernel: float) -> gtsam.noiseModel.Base:
 
 def _odometry(record: OdometryRecord) -> gtsam.NonlinearFactor:
     """Return the linear factor of OdometryRecord, stated at the origin of the state space."""
-    from_origin = -np.eye(4)
-    from_origin[:2, 2:] = record.interval_s * np.eye(2)
+    from_origin, from_target = -np.eye(4), np.eye(4)
+    from_origin[:2, 2:] = from_target[:2, 2:] = 0.5 * record.interval_s * np.eye(2)
     from_parameters = np.zeros((4, 2))
     from_parameters[:2, 0] = QUARTER_TURN @ record.moved_m
     from_parameters[:2, 1] = record.moved_m
@@ -75,7 +75,7 @@ def _odometry(record: OdometryRecord) -> gtsam.NonlinearFactor:
     zero.insert(record.parameters, np.zeros(2))
     linear = gtsam.JacobianFactor(
         record.target,
-        np.eye(4),
+        from_target,
         record.origin,
         from_origin,
         record.parameters,

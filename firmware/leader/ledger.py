@@ -84,8 +84,8 @@ class PriorRecord:
 class OdometryRecord:
     """Dead reckoning between two nodes: moved_m (2,) in interval_s, with the noise of both parts.
 
-    Its error is the first line of Eq. 11: x' - x - moved + bias dt + heading J moved + scale moved,
-    where J turns by +90 degrees; the bias wanders.
+    Its error is the first line of Eq. 11: x' - x - moved + (bias + bias') dt / 2 + heading J moved
+    + scale moved, where J turns by +90 degrees; the bias wanders, and so steps compose exactly.
     """
 
     origin: int

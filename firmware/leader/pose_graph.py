@@ -35,7 +35,7 @@ from firmware.leader.ledger import (
     SharedDriftRecord,
     TieRecord,
 )
-from firmware.leader.wander import expected_walk, likely_walk, reckoned_m2
+from firmware.leader.wander import bridged_m2, expected_walk, likely_walk, reckoned_m2
 from firmware.submaps import Track
 from protocol.errors import EstimationError
 
@@ -98,7 +98,7 @@ class PoseGraph(Estimate):
         origin, moved_m = old.keys[-1], reached_m - old.reckoned_m[-1]
         passed_s = time_s - old.times_s[-1]
         interval_s = max(passed_s, 0.0)  # of a clock that was set back nobody knows it
-        variance_m2 = reckoned_m2(interval_s, s.odometry_noise, self._walk, start_m=sigma_m)
+        variance_m2 = sigma_m**2 + bridged_m2(interval_s, s.odometry_noise, self._walk)
         wandered_mps = self._walk * np.sqrt(abs(passed_s) + s.node_interval_s)
         state = self._state(origin).copy()
         state[:2] += moved_m - state[2:] * interval_s

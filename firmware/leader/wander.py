@@ -54,6 +54,14 @@ def reckoned_m2(
     return start_m**2 + drifted + walk**2 * duration_s**3 / 3
 
 
+def bridged_m2(duration_s: float, noise: float, walk: float) -> float:
+    """Return the variance, each axis, of dead reckoning between two times whose drift is given.
+
+    Their mean is the drift of a random walk between them, give or take walk^2 / 12 times duration.
+    """
+    return (noise**2 + walk**2 * duration_s**2 / 12) * duration_s
+
+
 def changes_of(times_s: Array, bias_mps: Array, expected: Array, found: Array) -> list[DriftChange]:
     """Return the changes between successive epochs (K,) of a drift (K, 2).
 

@@ -41,7 +41,7 @@ def test_odometry_is_as_unsure_as_noise_walk_and_what_was_lost() -> None:
     assert (record.origin, record.target, record.parameters) == (101, 102, 99)
     assert record.moved_m == pytest.approx([40.0, 0.0])
     assert record.interval_s == 20.0
-    variance_m2 = 0.2**2 * 20.0 + 0.01**2 * 20.0**3 / 3.0 + (3.0 * LOST_SIGMA_MPS) ** 2
+    variance_m2 = 0.2**2 * 20.0 + 0.01**2 * 20.0**3 / 12.0 + (3.0 * LOST_SIGMA_MPS) ** 2
     assert record.position_sigma_m**2 == pytest.approx(variance_m2)
     assert record.bias_sigma_mps**2 == pytest.approx(0.01**2 * 20.0)
 

@@ -85,6 +85,24 @@ def test_variance_of_dead_reckoning_is_what_many_short_steps_add_up_to() -> None
     assert found_m2 == pytest.approx(covariance[0, 0], rel=2e-3)
 
 
+@pytest.mark.parametrize("unheard_s", [0.0, 600.0, 3600.0])
+def test_way_unheard_of_is_as_unsure_as_many_short_steps(unheard_s: float) -> None:
+    settings = GraphSettings()
+    time_s = np.concatenate([[0.0], np.arange(unheard_s, 4801.0)])
+    still = np.zeros_like(time_s)
+    graph = PoseGraph(settings)
+    graph.add_chain(0, 0.0, np.zeros(2), np.zeros(2))
+    graph.extend(0, Track(time_s=time_s, north_m=still, east_m=still, yaw_rad=still))
+    expected_m2 = reckoned_m2(
+        4800.0,
+        settings.odometry_noise,
+        settings.bias_walk,
+        start_m=settings.start_sigma_m,
+        drift_mps=settings.bias_sigma_mps,
+    )
+    assert np.diag(graph.predicted_covariance(0, 4800.0)) == pytest.approx(expected_m2)
+
+
 def test_without_evidence_the_belief_stays() -> None:
     told_nothing = BELIEVED**2 * INTERVAL_S * np.eye(2)
     blind = DriftChange(

@@ -41,7 +41,7 @@ class Estimate:
         self._settings = settings
         self._chains: dict[int, Chain] = {}
         self._ledger: dict[int, Entry] = {}
-        self._walk = settings.bias_walk
+        self._walk = settings.bias_walk  # of the water, as far as it is known by now
         self._solver = Solver(self._ledger, settings.robust_kernel)
         self._trajectories: dict[int, Trajectory] = {}  # both until the next change
         self._covariances: dict[int, Array] = {}  # of nodes by their keys

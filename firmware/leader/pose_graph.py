@@ -47,6 +47,7 @@ class PoseGraph(Estimate):
 
     def __init__(self, settings: GraphSettings) -> None:
         super().__init__(settings)
+        self._chain_walk = settings.bias_walk  # of a chain by itself: ties between chains tell, too
         self._entered = 0
 
     def add_chain(self, chain_id: int, time_s: float, reckoned_m: Array, start_m: Array) -> None:
@@ -98,8 +99,8 @@ class PoseGraph(Estimate):
         origin, moved_m = old.keys[-1], reached_m - old.reckoned_m[-1]
         passed_s = time_s - old.times_s[-1]
         interval_s = max(passed_s, 0.0)  # of a clock that was set back nobody knows it
-        variance_m2 = sigma_m**2 + bridged_m2(interval_s, s.odometry_noise, self._walk)
-        wandered_mps = self._walk * np.sqrt(abs(passed_s) + s.node_interval_s)
+        variance_m2 = sigma_m**2 + bridged_m2(interval_s, s.odometry_noise, self._chain_walk)
+        wandered_mps = self._chain_walk * np.sqrt(abs(passed_s) + s.node_interval_s)
         state = self._state(origin).copy()
         state[:2] += moved_m - state[2:] * interval_s
         target = self._append(chain, time_s, reckoned_m, state)
@@ -227,7 +228,7 @@ class PoseGraph(Estimate):
     def compose(self, now_s: float, settings: CompositionSettings) -> None:
         """Make the past coarse, learn how much drift wanders, and restart ISAM2 from the ledger."""
         self.update()
-        walk = self._learned_walk(now_s)
+        walks = self._learned_walks(now_s)
         estimate = self._states()
         pinned, detail_s = pinned_keys(self._ledger.values()), detail_from_s(now_s, settings)
         kept = {
@@ -239,7 +240,7 @@ class PoseGraph(Estimate):
             owners |= chain.owners(kept[chain_id])
         apart_m2 = self.apart_m2(owners)
         shapes = {chain_id: self.trajectory(chain_id).until(detail_s) for chain_id in self._chains}
-        self._walk = walk
+        self._walk, self._chain_walk = walks
         for chain_id, chain in self._chains.items():
             chain.drop(kept[chain_id], shapes[chain_id], apart_m2)
         old = {
@@ -258,17 +259,17 @@ class PoseGraph(Estimate):
         self._solver.restart(self._states())
         self._forget_solution()
 
-    def _learned_walk(self, now_s: float) -> float:
+    def _learned_walks(self, now_s: float) -> tuple[float, float]:
+        """Return the walk of the water's drift, and that with which tied chains expect as much."""
         s = self._settings
         try:
             changes = self.drift_changes(now_s)
         except EstimationError:  # what is not known now may be the next time
             changes = []
         if not changes:
-            return self._walk
-        return (
-            self._walk * likely_walk(changes, s.bias_walk, s.walk_factor) / expected_walk(changes)
-        )
+            return self._walk, self._chain_walk
+        walk = likely_walk(changes, s.bias_walk, s.walk_factor)
+        return walk, self._chain_walk * walk / expected_walk(changes)
 
     def _append(self, chain: Chain, time_s: float, reckoned_m: Array, state: Array) -> int:
         key: int = gtsam.symbol("x", (chain.number << 24) | chain.added)
@@ -298,7 +299,7 @@ class PoseGraph(Estimate):
 
     def _join(self, chain: Chain, node: int) -> None:
         noise = self._settings.odometry_noise
-        self._enter(chain.odometry(node - 1, node, noise, self._walk))
+        self._enter(chain.odometry(node - 1, node, noise, self._chain_walk))
 
     def _walk_alike(self, chain: Chain, begin_s: float, end_s: float) -> None:
         first = next(iter(self._chains.values()))

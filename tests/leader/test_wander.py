@@ -145,6 +145,7 @@ def test_vehicles_that_share_a_drift_do_not_vouch_for_stillness(vehicles: int) -
         joint = graph._solver.covariance([key for key in keys if key is not None])[2::4, 2::4]
         walk = np.sqrt((joint[0, 0] + joint[1, 1] - 2 * joint[0, 1]) / 600.0)
         assert walk == pytest.approx(BELIEVED, rel=0.1)
+        assert graph.wandering.walk == pytest.approx(BELIEVED, rel=1e-3)
 
 
 def test_graph_that_cannot_tell_its_drift_is_composed_and_learns_nothing(

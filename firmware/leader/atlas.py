@@ -17,6 +17,7 @@ from protocol.vehicles import LEADER, VEHICLES
 
 FOOTPRINT_M = 10.0
 """Tiles in which footprints are compared: a tenth of a sub-map."""
+_GAP_S = 4.0  # a slice of a track, as a frame tells it: not far beyond nothing can be anchored
 
 
 def chain_of(vehicle: int, boot: int) -> int:
@@ -66,7 +67,10 @@ class Sheet:
 
 
 def sheet_of(sheet_id: SheetId, track: Track, grid: GriddedSubmap) -> Sheet | None:
-    """Return the sheet of a grid, or None if no cell of it is known."""
+    """Return the sheet of a grid, or None if no cell of it is known.
+
+    Its time is the middle one of the cells, or the nearest to it of which the track tells.
+    """
     rows, columns = np.nonzero(np.isfinite(grid.depth_m))
     if rows.size == 0:
         return None
@@ -75,11 +79,14 @@ def sheet_of(sheet_id: SheetId, track: Track, grid: GriddedSubmap) -> Sheet | No
     )
     low, occupied = _occupancy(known_m)
     tiles_m = ((low + np.argwhere(occupied)).astype(np.float64) + 0.5) * FOOTPRINT_M
+    time_s = float(np.nanmedian(grid.time_s))
+    if track.gap_s(time_s) > _GAP_S:
+        time_s = float(track.time_s[np.argmin(np.abs(track.time_s - time_s))])
     return Sheet(
         id=sheet_id,
         track=track,
         grid=grid,
-        time_s=float(np.nanmedian(grid.time_s)),
+        time_s=time_s,
         tiles_m=tiles_m,
         centre_m=tiles_m.mean(axis=0),
     )

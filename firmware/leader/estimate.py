@@ -85,7 +85,8 @@ class Estimate:
     def anchor(self, chain_id: int, time_s: float, track: Track) -> Anchor:
         """Return the node nearest in time, and the offset from it to the position at the time.
 
-        Raises EstimationError if the chain has no node within two intervals of the time.
+        Raises EstimationError if the chain has no node within two intervals of the time, or the
+        track no state within half of one, as `PoseGraph.extend` wants of a node.
         """
         if chain_id not in self._chains:
             raise EstimationError(f"there is no chain {chain_id} in the graph")
@@ -99,6 +100,8 @@ class Estimate:
                 f"chain {chain_id} has no node near {time_s:.1f} s; the nearest is at"
                 f" {known_s:.1f} s"
             )
+        if track.gap_s(time_s) > self._settings.node_interval_s / 2:
+            raise EstimationError(f"the track of chain {chain_id} has no state near {time_s:.1f} s")
         if in_shape:
             return self._anchor_in_shape(chain_id, key, time_s, track)
         lost_m2 = self.lost_m2(chain_id, chain.times_s[nearest], time_s)

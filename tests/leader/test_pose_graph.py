@@ -57,6 +57,18 @@ def close(
     return graph.add_closure(ends[0], ends[1], offset_m, np.eye(2), active=True)
 
 
+def test_nothing_is_anchored_where_a_track_is_unknown() -> None:
+    track, _ = walk(np.random.default_rng(1), 400, 0.3)
+    heard = (track.time_s <= 180.0) | (track.time_s >= 220.0)
+    gapped = Track(**{f.name: getattr(track, f.name)[heard] for f in dataclasses.fields(track)})
+    graph = started(gapped)
+    for time_s in (180.0, 184.0, 216.0, 220.0):
+        graph.anchor(0, time_s, gapped)
+    for time_s in (188.0, 200.0, 212.0):
+        with pytest.raises(EstimationError, match="no state near"):
+            graph.anchor(0, time_s, gapped)
+
+
 def test_closures_recover_the_drift_that_dead_reckoning_hides() -> None:
     track, true_m = walk(np.random.default_rng(1), 800, 0.3)
     graph = started(track)

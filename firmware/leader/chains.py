@@ -64,6 +64,14 @@ class Chain:
         lasted_s = (min(max(time_s, begin_s), end_s) - begin_s for begin_s, end_s in self.lost)
         return LOST_SIGMA_MPS**2 * sum(s**2 for s in lasted_s)
 
+    def newest_s(self, leap_s: float, lasting_s: float) -> float:
+        """Return the time of the newest node, or of the last before a leap that has yet to last."""
+        recent = bisect.bisect_left(self.times_s, self.times_s[-1] - lasting_s)
+        for before_s, time_s in itertools.pairwise(self.times_s[max(recent - 1, 0) :]):
+            if time_s - before_s > leap_s:
+                return before_s
+        return self.times_s[-1]
+
     def key_at(self, time_s: float) -> int | None:
         """Return the key of the node at exactly this time, or None."""
         at = bisect.bisect_left(self.times_s, time_s)

@@ -161,7 +161,7 @@ class LeaderCore:
             self._add_sheet(sheet)
         self._fixes.use(self.fleet, self.graph, now_s)
         if self._is_to_compose and not self._closing.is_matching:
-            self._compose(self.graph.newest_s)
+            self._compose(self._newest_s)
 
     @property
     def has_jobs(self) -> bool:
@@ -258,7 +258,12 @@ class LeaderCore:
     @property
     def _is_to_compose(self) -> bool:
         """Whether the past is to be composed as soon as no matches are out."""
-        return self.graph.newest_s - self._tried_s >= self._settings.composition.interval_s
+        return self._newest_s - self._tried_s >= self._settings.composition.interval_s
+
+    @property
+    def _newest_s(self) -> float:
+        s = self._settings.composition
+        return self.graph.newest_s(leap_s=s.detail_s, lasting_s=s.interval_s)
 
     def _compose(self, newest_s: float) -> None:
         """Make the past coarse, so that a day costs no more an hour than its first hours.

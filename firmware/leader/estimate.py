@@ -56,10 +56,13 @@ class Estimate:
         """How many nodes there are."""
         return sum(len(chain.keys) for chain in self._chains.values())
 
-    @property
-    def newest_s(self) -> float:
-        """The time of the newest node of all vehicles, whatever a clock says."""
-        return max(chain.times_s[-1] for chain in self._chains.values())
+    def newest_s(self, leap_s: float, lasting_s: float) -> float:
+        """Return the time of the newest node of all vehicles, whatever a clock says.
+
+        Nodes after a gap of more than leap_s count once they have gone on for lasting_s: a clock
+        may have leapt.
+        """
+        return max(chain.newest_s(leap_s, lasting_s) for chain in self._chains.values())
 
     @property
     def wandering(self) -> Wandering:

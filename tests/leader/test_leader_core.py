@@ -216,6 +216,24 @@ def test_clock_that_leaps_ahead_neither_stops_composition_nor_coarsens_the_prese
     assert len(leader.graph.trajectory(0).time_s) > leader.graph.nodes > 1200 / 10
 
 
+def test_whole_clock_that_leaps_for_a_moment_does_not_coarsen_the_past() -> None:
+    path = line(0.0, 0.0)
+    leader, composed_s = leader_of(path), []
+    for second in range(1, 2000):
+        ahead_s = 3600.0 if 1300 < second <= 1312 else 0.0
+        sail(leader, lambda t, a=ahead_s: path(t - a), second + ahead_s, sonar_on=False)  # type: ignore[misc]
+        if second % 20 == 0 and second > 40 and not ahead_s:
+            states = walked(20, 2.0 * (second - 40))
+            leader.receive_frame(trajectory(states, second - 40.0), None, float(second))
+        leader.poll(second + ahead_s)
+        leader.tick(second + ahead_s)
+        composed_s += [] if leader.composed_s in composed_s else [leader.composed_s]
+    assert composed_s[:5] == [0.0, 300.0, 600.0, 900.0, 1200.0]
+    assert np.diff(composed_s[4:]) == pytest.approx(300.0, abs=30.0)
+    assert composed_s[-1] > 1600.0
+    assert sum(time_s < 1300.0 for time_s in leader.graph._chains[0].times_s) > 80
+
+
 @pytest.mark.parametrize(("answers", "asked"), [("paper", 0), ("extended", 1)])
 def test_only_an_answer_that_tells_of_the_leader_asks_where_it_is(
     answers: str, asked: int, monkeypatch: pytest.MonkeyPatch

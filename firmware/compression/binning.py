@@ -45,7 +45,6 @@ class SoundingBins:
         self.dropped_bad = 0
         self.dropped_fliers = 0  # as of the last result
         self._late_fliers = 0
-        self.coarsened = 0
         self.soundings = 0
 
     def add(self, soundings_ned_m: Array, time_s: Array | float) -> None:
@@ -132,7 +131,6 @@ class SoundingBins:
 
     def _coarsen(self) -> None:
         """Double the cell; each new cell keeps the soundings first held by its parts."""
-        self.coarsened += 1
         self._cell_m *= 2.0
         keys = _halved(self._keys)
         order = np.argsort(keys, kind="stable")

@@ -116,29 +116,26 @@ class PoseGraph(Estimate):
             )
         )
 
-    def extend(self, chain_id: int, track: Track) -> int:
-        """Add the nodes that a vehicle's newly known track allows; return how many.
+    def extend(self, chain_id: int, track: Track) -> None:
+        """Add the nodes that a vehicle's newly known track allows.
 
         Epochs in a gap of the track are passed over: positions are composed, so the next node
         ties to the last across the gap.
         """
         if not track.time_s.size:
-            return 0
+            return
         chain, s = self._chains[chain_id], self._settings
         interval_s = s.node_interval_s
         first = np.floor(chain.times_s[-1] / interval_s + 1e-9) + 1
         last = np.floor(track.time_s[-1] / interval_s + 1e-9)
         near = track.time_s[np.searchsorted(track.time_s, (first - 1) * interval_s) :] / interval_s
         epochs = np.unique([np.floor(near), np.ceil(near)])  # few, however far a clock leaps
-        added = 0
         for epoch in epochs[(first <= epochs) & (epochs <= last)].tolist():
             time_s = epoch * interval_s
             if track.gap_s(time_s) <= interval_s / 2:
                 self._step(chain, time_s, track.position_at(time_s))
                 if time_s % s.alike_interval_s == 0.0:
                     self._walk_alike(chain, time_s - s.alike_interval_s, time_s)
-                added += 1
-        return added
 
     def lose(self, chain_id: int, begin_s: float, end_s: float) -> None:
         """Say of a span, before it has nodes, that nobody knows how far a vehicle went in it."""

@@ -27,7 +27,7 @@ LEAST_OTHER_SIGN_SHARE = 0.1
 MOST_ZEROS_SHARE = 0.01
 """Of a grid that declares no no-data: with more cells of exactly zero, it may mean them by that."""
 FILLS = (-9999, 9999, -32768, -32767, 32767, -99999, 99999, -999999)
-"""Stored where nothing was measured: believed of files that declare no such value themselves."""
+"""Stored where nothing was measured, though a file may declare another value or none."""
 COLOURS = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.palette)
 OTHER_UNITS = re.compile(
     r"((us|international|survey)[ _-])*(ft|f[eo]{2}t|fathom|yard|inch)"
@@ -173,7 +173,7 @@ def _check_heights(path: Path, dataset: DatasetReader) -> None:
 def _values(dataset: DatasetReader, stored: np.ma.MaskedArray) -> NDArray[np.float64]:
     """Return metres, scaled as the band says, NaN where it holds no data or a usual fill."""
     values: NDArray[np.float64] = np.ma.filled(stored.astype(np.float64), np.nan)
-    if dataset.nodata is None:
+    if dataset.nodata is None or dataset.scales[0] == 1.0:  # in centimetres -9999 is a depth
         values[np.isin(values, FILLS)] = np.nan
     return values * float(dataset.scales[0]) + float(dataset.offsets[0])
 

@@ -133,15 +133,16 @@ def test_scale_and_offset_of_the_band_make_metres(tmp_path: Path, up: float) -> 
 
 
 @pytest.mark.parametrize("up", [1.0, -1.0])
+@pytest.mark.parametrize("declared", [None, -12345.0])
 @pytest.mark.parametrize("fill", [-9999.0, 9999.0, -32768.0, -32767.0, -99999.0, 1e20, "land"])
 def test_a_fill_that_is_not_declared_is_no_seabed_and_is_told(
-    tmp_path: Path, fill: float | str, up: float
+    tmp_path: Path, fill: float | str, up: float, declared: float | None
 ) -> None:
     elevation_m = slope()
     elevation_m[40:60] = np.nan
     stored = up * elevation_m
     stored[150:180, 100:] = fill = up * 250.0 if isinstance(fill, str) else fill
-    terrain = open_terrain(write_raster(tmp_path / "a.tif", stored, nodata=None))
+    terrain = open_terrain(write_raster(tmp_path / "a.tif", stored, nodata=declared))
     elevation_m[150:180, 100:] = np.nan
     np.testing.assert_array_equal(terrain.coarse_m, elevation_m.astype(np.float32))
     np.testing.assert_array_equal(terrain.read(0, 0, 300, 300), elevation_m.astype(np.float32))

@@ -14,6 +14,8 @@ import termios
 import tty
 from pathlib import Path
 
+from protocol.errors import ConfigError
+
 READ_BYTES = 65_536
 BACKLOG_BYTES = 65_536
 """What a modem has said to a host that does not read; older bytes are lost, as on a real line."""
@@ -48,9 +50,14 @@ class PseudoPort:
         return self._master
 
     def plug(self) -> None:
-        """Make the terminal, and let the link point to it."""
+        """Make the terminal, and let the link point to it.
+
+        Raises ConfigError where a file or another port has the link's name.
+        """
         if self._master is not None:
             return
+        if self._link is not None and self._link.exists():  # a dead port's link leads nowhere
+            raise ConfigError(f"{self._link} is there already; remove it or give another folder")
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
@@ -64,13 +71,14 @@ class PseudoPort:
 
     def unplug(self) -> None:
         """Take the terminal away, as a pulled cable does; whoever has it open gets errors."""
+        if self._link is not None and self._slave is not None:
+            if self._link.is_symlink() and str(self._link.readlink()) == os.ttyname(self._slave):
+                self._link.unlink()
         for descriptor in (self._master, self._slave):
             if descriptor is not None:
                 os.close(descriptor)
         self._master = self._slave = None
         self._backlog.clear()
-        if self._link is not None:
-            self._link.unlink(missing_ok=True)
 
     def read(self) -> bytes:
         """Return what the host has written, as heard at our speed."""

@@ -55,9 +55,14 @@ class ProcessGroup:
         self._is_ending = False
         self._socket = self._listen()
         self._modems = modems
-        self.nodes = {vehicle: self._node(vehicle) for vehicle in water.nodes}
-        for node in self.nodes.values():
-            node.in_real_time = pace is not None
+        self.nodes: dict[int, RemoteNode] = {}
+        try:
+            for vehicle in water.nodes:
+                self.nodes[vehicle] = self._node(vehicle)
+                self.nodes[vehicle].in_real_time = pace is not None
+        except BaseException:
+            self.close()
+            raise
 
     def __enter__(self) -> "ProcessGroup":
         return self
@@ -143,18 +148,20 @@ class ProcessGroup:
         )
 
     def _listen(self) -> socket.socket:
-        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            self._socket_path.unlink(missing_ok=True)
-            listener.bind(str(self._socket_path))
-        except OSError as error:
-            listener.close()
-            raise ConfigError(
-                f"cannot make the clock's socket {self._socket_path}: {error}; "
-                "give --ports a short path to a folder of yours"
-            ) from error
-        listener.listen(BACKLOG)
+        with contextlib.ExitStack() as closing:
+            listener = closing.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
+            try:
+                self.folder.mkdir(parents=True, exist_ok=True)
+                if _is_left_behind(self._socket_path):
+                    self._socket_path.unlink()
+                listener.bind(str(self._socket_path))
+            except OSError as error:
+                raise ConfigError(
+                    f"cannot make the clock's socket {self._socket_path}: {error}; "
+                    "give --ports a short path to a folder of yours"
+                ) from error
+            listener.listen(BACKLOG)
+            closing.pop_all()
         return listener
 
     def look(self, wait_s: float = WAIT_S) -> None:
@@ -214,3 +221,15 @@ class ProcessGroup:
                 self._ended.add(node.vehicle)
         if not line.is_open:
             node.leave()
+
+
+def _is_left_behind(path: Path) -> bool:
+    """Return whether a path is a socket at which nobody listens; ConfigError if somebody does."""
+    if not path.is_socket():
+        return False
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as line:
+        try:
+            line.connect(str(path))
+        except OSError:
+            return True
+    raise ConfigError(f"a channel runs at {path.parent}; end it, or give --ports another folder")

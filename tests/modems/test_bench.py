@@ -125,6 +125,23 @@ def test_a_host_at_another_speed_hears_garbage(tmp_path: Path) -> None:
     assert not (tmp_path / "port").exists()
 
 
+def test_a_port_takes_the_name_of_a_dead_one_alone(tmp_path: Path) -> None:
+    link = tmp_path / "port"
+    link.write_text("mine")
+    with pytest.raises(ConfigError, match="port is there already; remove it"):
+        PseudoPort(9600, link)
+    assert link.read_text() == "mine"
+    link.unlink()
+    live = PseudoPort(9600, link)
+    with pytest.raises(ConfigError, match="port is there already; remove it"):
+        PseudoPort(9600, link)
+    assert link.exists()
+    live.close()
+    link.symlink_to(tmp_path / "gone")
+    PseudoPort(9600, link).close()
+    assert not link.is_symlink()
+
+
 def test_a_host_that_does_not_read_costs_a_bounded_backlog() -> None:
     port = PseudoPort(19_200)
     for _ in range(200):

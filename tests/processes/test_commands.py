@@ -4,6 +4,7 @@ import itertools
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -95,6 +96,18 @@ def test_what_is_wrong_with_a_port_or_a_clock_is_one_line(
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
+
+
+def test_a_channel_that_runs_keeps_its_ports(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as running:
+        running.bind(str(tmp_path / "clock"))
+        running.listen()
+        arguments = ["channel", "--ports", str(tmp_path), "--out", str(tmp_path / "out"), *SHORT]
+        assert main(arguments) == 2
+    assert f"a channel runs at {tmp_path}; end it, or give" in capsys.readouterr().err
+    assert (tmp_path / "clock").is_socket()
 
 
 @pytest.fixture

@@ -16,6 +16,7 @@ from host_tools.processes.remote_node import RemoteNode
 from protocol.acoustics import Delivery, Water
 from protocol.modems.dialect_driver import check_frame_size
 from protocol.modems.micromodem_settings import FRAMES_AND_BYTES
+from protocol.modems.nanomodem import ENVELOPE_BYTES
 from protocol.modems.nanomodem import FRAME_BYTES as NANOMODEM_FRAME_BYTES
 from protocol.packets import FRAME_BYTES
 
@@ -63,7 +64,8 @@ class EmulatedModems:
         self.scheme, self.baud = kind, _BAUD[kind]
         make: Callable[[int], Unit] = MicroModemUnit if kind == "micromodem" else NanomodemUnit
         units = {vehicle: make(address_of(vehicle)) for vehicle in water.nodes}
-        self.bench = Bench(water, units, lambda delivery: _each_frame(delivery, record))
+        envelope_bytes = 0 if kind == "micromodem" else ENVELOPE_BYTES
+        self.bench = Bench(water, units, lambda one: _each_frame(one, envelope_bytes, record))
 
     def run(
         self,
@@ -137,10 +139,12 @@ def _wait(condition: Callable[[], bool]) -> None:
         time.sleep(NAP_S)
 
 
-def _each_frame(delivery: Delivery, record: Callable[[Delivery], None]) -> None:
-    """Record a packet of whole 256-byte frames frame by frame, anything else as it is."""
+def _each_frame(
+    delivery: Delivery, envelope_bytes: int, record: Callable[[Delivery], None]
+) -> None:
+    """Record a packet without what its driver puts before a frame, 256-byte frames one by one."""
     size = FRAMES_AND_BYTES[4][1]
     whole = delivery.frame if delivery.sent is None else delivery.sent
-    for k in range(0, len(whole), size):
+    for k in range(envelope_bytes, len(whole), size):
         part = slice(k, k + size)
         record(replace(delivery, frame=delivery.frame[part], sent=whole[part]))

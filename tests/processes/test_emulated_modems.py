@@ -12,6 +12,7 @@ from firmware.follower.settings import FollowerSettings
 from firmware.ports import ModemPort
 from firmware.soundings import Odometry
 from host_tools.cli import main
+from host_tools.inspector import inspect_file
 from host_tools.processes.emulated_modems import _each_frame
 from host_tools.writers import link_counts
 from protocol.acoustics import Delivery, Water, WaterSettings
@@ -88,12 +89,27 @@ def test_a_packet_of_two_frames_is_recorded_as_both_and_as_they_were_sent() -> N
         sent=sent,
     )
     recorded: list[Delivery] = []
-    _each_frame(packet, recorded.append)
+    _each_frame(packet, 0, recorded.append)
     assert [(d.frame, d.sent) for d in recorded] == [
         (heard[:256], sent[:256]),
         (heard[256:], sent[256:]),
     ]
     assert link_counts(recorded)["bytes_on_air"] == 512
+
+
+def test_a_packet_is_recorded_without_its_drivers_envelope() -> None:
+    packet = Delivery(
+        source=1,
+        destination=0,
+        t_tx_s=8.0,
+        t_rx_s=8.2,
+        t_delivered_s=11.0,
+        frame=b"\x01\x07" + bytes(22),
+        fate="delivered",
+    )
+    recorded: list[Delivery] = []
+    _each_frame(packet, 2, recorded.append)
+    assert [(d.frame, d.sent) for d in recorded] == [(bytes(22), bytes(22))]
 
 
 @pytest.mark.slow
@@ -129,7 +145,8 @@ def test_a_mission_of_small_lattice_frames_on_emulated_nanomodems(tmp_path: Path
     frames = [json.loads(line) for line in (tmp_path / "air.jsonl").read_text().splitlines()]
     ours = [frame for frame in frames if frame["source"] == 1]
     assert len(ours) >= 60
-    assert {len(frame["hex"]) for frame in ours} == {2 * (62 + 2)}  # behind sender and sequence
+    assert {len(frame["hex"]) for frame in ours} == {2 * 62}
+    assert not any("dropped" in line for line in inspect_file(tmp_path / "air.jsonl"))
     leader = json.loads((tmp_path / "processes" / "leader.json").read_text())
     assert leader.get("submaps_not_rebuilt", 0) <= 1  # the last one may be cut
     follower = json.loads((tmp_path / "processes" / "follower_1.json").read_text())

@@ -135,8 +135,15 @@ def parse_changes(texts: Sequence[str]) -> dict[str, object]:
         key, equals, value = text.partition("=")
         if not equals or not key.strip():
             raise ConfigError(f"--set {text!r} is not KEY=VALUE, such as --set duration_min=10")
+        changes.pop(key.strip(), None)  # the later one comes after what was set in between
         changes[key.strip()] = value.strip()
     return changes
+
+
+def check_apart(source: Path, out: Path) -> None:
+    """Raise ConfigError where an output would be written over its input."""
+    if source.resolve() == out.resolve():
+        raise ConfigError(f"{out} would be written over its own input; give another name")
 
 
 def folder_of(text: str) -> Path:

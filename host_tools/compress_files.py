@@ -17,7 +17,7 @@ from firmware.follower.settings import FollowerSettings
 from firmware.geometry import Array
 from firmware.leader.reconstruction import ReconstructionSettings, reconstruct_packets
 from firmware.submaps import Track
-from host_tools.commands import CHOICES, Command
+from host_tools.commands import CHOICES, Command, check_apart
 from protocol.codec import decode, encode
 from protocol.errors import ConfigError, EstimationError, ProtocolError, RemoteProtocolError
 from protocol.lattice import PROTECTION_BYTES
@@ -367,6 +367,7 @@ def _configure_reconstruct(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_compress(arguments: argparse.Namespace) -> None:
+    check_apart(arguments.soundings, arguments.out)
     print(
         compress_file(
             arguments.soundings,
@@ -379,6 +380,7 @@ def _run_compress(arguments: argparse.Namespace) -> None:
 
 
 def _run_reconstruct(arguments: argparse.Namespace) -> None:
+    check_apart(arguments.frames, arguments.out)
     try:
         drop = {int(text) for text in arguments.drop.split(",") if text.strip()}
     except ValueError as error:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from host_tools.capture import LATEST_S, Captured, write_pcap
-from host_tools.commands import Command
+from host_tools.commands import Command, check_apart
 from protocol.codec import decode
 from protocol.errors import ConfigError, RemoteProtocolError
 from protocol.packets import (
@@ -174,6 +174,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 def _run(arguments: argparse.Namespace) -> None:
     if arguments.pcap is not None:
+        check_apart(arguments.file, arguments.pcap)
         print(f"{write_capture(arguments.file, arguments.pcap)} frames in {arguments.pcap}")
         return
     for line in inspect_file(arguments.file):

@@ -17,7 +17,7 @@ import numpy as np
 from rasterio.warp import transform
 
 from firmware.geometry import Array
-from host_tools.commands import Command
+from host_tools.commands import Command, check_apart
 from protocol.errors import ConfigError
 
 IGNORED_BEAM = 0x01  # bit 0 of a beam's flags, and of a ping's
@@ -181,6 +181,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    check_apart(arguments.log, arguments.out)
     line = read_gsf(arguments.log)
     line.save(arguments.out)
     print(

@@ -10,7 +10,8 @@ import pytest
 
 from host_tools.cli import main
 from host_tools.command_line import build_parser
-from host_tools.commands import status_of
+from host_tools.commands import parse_changes, status_of
+from host_tools.mission_settings import MissionSettings, changed
 from protocol.codec import encode
 from protocol.packets import Answer, Header, Profile, SubmapPacket
 
@@ -301,3 +302,30 @@ def test_help_says_what_every_argument_is() -> None:
     arguments = list(arguments_of(build_parser()))
     assert len(arguments) > 50
     assert [(prog, action.dest) for prog, action in arguments if not action.help] == []
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["replay", "one", "--out", "one"],
+        ["compress", "one", "--out", "./one"],
+        ["reconstruct", "one", "--out", "one"],
+        ["inspect", "one", "--pcap", "one"],
+    ],
+)
+def test_no_output_is_written_over_its_input(
+    command: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("one").write_bytes(bytes(256))
+    assert main(command) == 2
+    assert "one would be written over its own input" in capsys.readouterr().err
+    assert Path("one").read_bytes() == bytes(256)
+
+
+def test_of_two_values_of_a_key_the_later_one_counts() -> None:
+    changes = parse_changes(["leg_m=200", "scenario.leg_m=300", "leg_m=100"])
+    assert changed(MissionSettings(), changes).scenario.leg_m == 100.0

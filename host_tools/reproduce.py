@@ -73,6 +73,14 @@ def outcome_of(scenario: str, baseline: str, seed: int, evaluation: Evaluation) 
     )
 
 
+def check_sites(terrain: Path | None, seeds: Sequence[int]) -> None:
+    """Raise ConfigError where a simulation finds no room, before the first has begun."""
+    raster = open_terrain(terrain)
+    for scenario in SCENARIOS:
+        for seed in seeds:
+            place_survey(raster, named_scenario(scenario), seed)
+
+
 def simulations(
     terrain: Path | None, seeds: Sequence[int], announce: Callable[[str], None]
 ) -> Iterable[Outcome]:
@@ -156,15 +164,15 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 def _run(arguments: argparse.Namespace) -> None:
     folder = None if arguments.out is None else prepare_folder(arguments.out)
+    seeds = range(1, arguments.seeds + 1)
+    check_sites(arguments.terrain, seeds)
     trial = _trial(arguments.terrain, arguments.pairs)
     lines = ["Section 6.1, Figure 8: closures between sub-maps", *trial_lines(trial), ""]
     print("\n".join(lines))
     total = len(SCENARIOS) * len(BASELINES) * arguments.seeds
     with tqdm(total=total, unit="mission", leave=False, disable=None) as bar:
         outcomes = []
-        for outcome in simulations(
-            arguments.terrain, range(1, arguments.seeds + 1), bar.set_description
-        ):
+        for outcome in simulations(arguments.terrain, seeds, bar.set_description):
             outcomes.append(outcome)
             bar.update()
     table = ["Section 6.2, simulations 1 and 2", *simulation_lines(outcomes)]

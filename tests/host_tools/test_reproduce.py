@@ -4,7 +4,9 @@ from pathlib import Path
 import pytest
 
 from host_tools.cli import main
-from host_tools.reproduce import Outcome, simulation_lines
+from host_tools.reproduce import Outcome, check_sites, simulation_lines
+from protocol.errors import ConfigError
+from tests.host_tools.test_terrain_placement import slope, write_raster
 
 
 def outcome(seed: int, live_m: float) -> Outcome:
@@ -47,3 +49,9 @@ def test_bad_counts_are_one_line_and_status_2(
         main(["reproduce", "--seeds", "0", "--out", str(tmp_path)])
     assert stopped.value.code == 2
     assert "argument --seeds: 0 is none; give 1 or more" in capsys.readouterr().err
+
+
+def test_terrain_too_small_for_a_simulation_is_told_before_the_first(tmp_path: Path) -> None:
+    path = write_raster(tmp_path / "small.tif", slope()[:100, :100])
+    with pytest.raises(ConfigError, match="needs"):
+        check_sites(path, [1])

@@ -44,7 +44,8 @@ def mission_of(scenario: ScenarioSettings, changes: Mapping[str, object]) -> Mis
 def changed(settings: MissionSettings, changes: Mapping[str, object]) -> MissionSettings:
     """Return the settings with changes by dotted or short key.
 
-    The leader is told how uncertain the scenario makes the starts, slots how many followers it has.
+    The leader is told how uncertain the scenario makes the starts, unless that is set, slots how
+    many followers it has.
     Nothing is told of compass and log: `mission_of` does.
 
     Raises ConfigError for a key that is unknown or ambiguous, or a value out of bounds.
@@ -57,10 +58,9 @@ def changed(settings: MissionSettings, changes: Mapping[str, object]) -> Mission
             f"slots have {settings.slots.followers} followers, the scenario has {followers}; "
             f"give followers={settings.slots.followers}"
         )
-    derived = {
-        "slots.followers": followers,
-        "leader.graph.start_sigma_m": told_m,
-    }
+    derived: dict[str, object] = {"slots.followers": followers}
+    if not any(key.endswith("graph.start_sigma_m") for key in changes):
+        derived["leader.graph.start_sigma_m"] = told_m
     return replace(settings, derived)
 
 

@@ -238,6 +238,8 @@ def test_uncertain_start_is_found_by_fixes() -> None:
             },
         )
         assert settings.leader.graph.start_sigma_m == 40.0
+        told = changed(settings, {"leader.graph.start_sigma_m": 1.0})
+        assert told.leader.graph.start_sigma_m == 1.0
         site = place_survey(open_terrain(None, 1), settings.scenario, 2)
         vehicles = simulated_vehicles(settings, site, 2)
         leader, _ = local_nodes(settings, vehicles)

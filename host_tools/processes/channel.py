@@ -146,7 +146,8 @@ def missing_lines(result: MissionResult, out: Path) -> list[str]:
     """Return a line for every vehicle whose process was not there to write all of its files."""
     all_files = [VehicleFiles(out, vehicle.vehicle) for vehicle in result.vehicles]
     return [
-        f"{files.name} left no {', '.join(missing)}: its process was not there at the end"
+        f"{files.name} left no {', '.join(missing)}: its process was not there at the end; what it"
+        f" believed ends at {files.last_belief_s():g} s, and stands still from there in all figures"
         for files in all_files
         if (missing := files.missing())
     ]

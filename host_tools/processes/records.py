@@ -73,16 +73,26 @@ class VehicleFiles:
         ConfigError
             When there is none, or hardly any.
         """
-        data = self._path("beliefs").read_bytes() if self._path("beliefs").exists() else b""
-        rows = np.frombuffer(data[: len(data) // _ROW_BYTES * _ROW_BYTES], dtype="<f8")
-        by_time = {float(row[0]): row for row in rows.reshape(-1, ROW_NUMBERS)}
+        by_time = {float(row[0]): row for row in self._rows()}
         if len(by_time) < 2:
-            raise ConfigError(f"{self._path('beliefs')} holds no mission; start {self.name} anew")
+            path = self._path("beliefs")
+            raise ConfigError(
+                f"{path} holds no mission; start {self.name} with --out {path.parents[1]}"
+            )
         known = np.array([by_time[t] for t in sorted(by_time)])
         known[:, YAW] = np.unwrap(known[:, YAW])
         columns = [np.interp(time_s, known[:, 0], known[:, k]) for k in range(ROW_NUMBERS)]
         columns[YAW] = wrap_angle(columns[YAW])
         return belief_columns(np.stack(columns, axis=1))
+
+    def last_belief_s(self) -> float:
+        """Return the newest time of the beliefs, NaN where there is none."""
+        return float(max(self._rows()[:, 0], default=np.nan))
+
+    def _rows(self) -> Array:
+        data = self._path("beliefs").read_bytes() if self._path("beliefs").exists() else b""
+        rows = np.frombuffer(data[: len(data) // _ROW_BYTES * _ROW_BYTES], dtype="<f8")
+        return rows.reshape(-1, ROW_NUMBERS)
 
     def write_counters(self, counters: Counters) -> None:
         """Write the counters."""

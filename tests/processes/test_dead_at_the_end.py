@@ -53,6 +53,7 @@ def test_what_is_there_is_written_and_what_is_missing_named(voyage: Voyage, tmp_
     assert "leader left no leader.soundings.npz, leader.npz" in "".join(lines)
     assert "follower_1 left no follower_1.json, follower_1.soundings.npz" in "".join(lines)
     assert "leader left no" in "".join(result.remarks)
+    assert "what it believed ends at 11 s, and stands still" in "".join(result.remarks)
     assert (tmp_path / "report.html").exists()
     assert (tmp_path / "air.jsonl").read_text().count("\n") == 1
 

@@ -1,9 +1,11 @@
 """`fathomlink channel`: the water between vehicles' processes, and their clock."""
 
 import argparse
+import contextlib
 import shlex
+import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,6 +30,16 @@ from host_tools.writers import forget_mission, prepare_folder, write_air, write_
 from protocol.acoustics import Delivery
 
 Ready = Callable[[ProcessGroup], None]
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[None]:
+    """Let a request to terminate end things as an interrupt from the keyboard does."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def host_mission(
@@ -186,7 +198,10 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         "--real-time", action="store_true", help="follow the wall clock; default: virtual time"
     )
     parser.add_argument(
-        "--ports", type=Path, metavar="DIR", help="where the ports' names go (default: /tmp)"
+        "--ports",
+        type=Path,
+        metavar="DIR",
+        help="where the ports' names go (default: a new one in /tmp)",
     )
     parser.add_argument(
         "--out",
@@ -211,7 +226,8 @@ def _run(arguments: argparse.Namespace) -> None:
         print(flush=True)
 
     total_s = round(voyage.settings.scenario.duration_s)
-    with tqdm(total=total_s, unit="s", desc="mission", leave=False, disable=None) as bar:
+    mission_bar = tqdm(total=total_s, unit="s", desc="mission", leave=False, disable=None)
+    with interruptible(), mission_bar as bar:
         result = host_mission(
             voyage,
             out,

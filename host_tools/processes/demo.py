@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import signal
 import subprocess
 import sys
 import time
@@ -18,6 +17,7 @@ from host_tools.processes.channel import (
     add_modem_argument,
     finish,
     host_mission,
+    interruptible,
     vehicle_command,
 )
 from host_tools.processes.emulated_modems import MODEMS
@@ -94,13 +94,12 @@ class Crew:
 @contextlib.contextmanager
 def crew() -> Iterator[Crew]:
     """Give a crew, and end its processes whatever happens, a request to terminate among it."""
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     processes = Crew()
-    try:
-        yield processes
-    finally:
-        processes.end()
-        signal.signal(signal.SIGTERM, before)
+    with interruptible():
+        try:
+            yield processes
+        finally:
+            processes.end()
 
 
 def run_demo(

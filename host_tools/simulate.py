@@ -89,6 +89,8 @@ def outcome_lines(evaluation: Evaluation) -> list[str]:
             f"{final.mean_m:9.2f} m {final.share_of_dead_reckoning:6.1%} {final.end_m:8.2f} m"
         )
     error = evaluation.registration
+    if not error.mapped_share > 0.0:
+        return [*lines, "nothing was mapped: too high above the seabed, or no sonar was on?"]
     lines.append(
         f"map against truth-navigated map, {error.mapped_share:.1%} of it: "
         f"mean {error.mean_m:.3f} m, "

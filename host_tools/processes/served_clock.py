@@ -212,6 +212,6 @@ def _connect(url: str) -> ControlLine:
     except OSError as error:
         connection.close()
         raise ModemUnavailable(
-            f"no channel at {url} ({error.strerror}); start fathomlink channel first"
+            f"no channel at {url} ({error.strerror or error}); start fathomlink channel first"
         ) from error
     return ControlLine(connection)

@@ -11,7 +11,7 @@ from typing import Protocol
 from host_tools.processes.control import Advance, Arrival, ControlLine, Done, End, Hello, Refused
 from protocol.crc import crc32c
 from protocol.errors import ConfigError, ModemUnavailable
-from protocol.modems.base import Modem, ModemEvent, ModemStatus, Reception
+from protocol.modems.base import Modem, ModemEvent, ModemStatus, Reception, Tap
 
 HANDOVER_S = 0.5
 """Of real time: a frame that has not come over the line by then is asked for again."""
@@ -36,15 +36,17 @@ class ChannelLine(Protocol):
 class CountedLine:
     """A dialect's line: the channel waits for its bytes, in both directions, before time goes on.
 
-    `tap` is to be the driver's.
+    `tap` is to be the driver's; it hands on to another.
     """
 
-    def __init__(self) -> None:
-        self.line_bytes = 0
+    def __init__(self, tap: Tap | None = None) -> None:
+        self.line_bytes, self._next = 0, tap
 
-    def tap(self, direction: str, data: bytes, now_s: float) -> None:  # noqa: ARG002
+    def tap(self, direction: str, data: bytes, now_s: float) -> None:
         """Count what goes out."""
         self.line_bytes += len(data) if direction == "out" else 0
+        if self._next is not None:
+            self._next(direction, data, now_s)
 
     def collect(self, arrivals: tuple[Arrival, ...], now_s: float) -> tuple[int, ...]:  # noqa: ARG002
         """Take nothing: the channel has seen the bytes at the port, the driver will read them."""

@@ -48,10 +48,11 @@ from host_tools.processes.served_clock import CountedLine, ServedClock, StampedM
 from host_tools.processes.voyage import Voyage, add_voyage_arguments, voyage_of
 from host_tools.simulator.vehicle import SimulatedVehicle
 from protocol.errors import ConfigError
-from protocol.modems.base import Modem, ModemContext
+from protocol.modems.base import Modem, ModemContext, Tap
 from protocol.modems.dialect_driver import DialectDriver, await_identified, check_frame_size
+from protocol.modems.raw_log import RawLog, new_log
 from protocol.modems.registry import open_modem
-from protocol.modems.sealed import SealedLink, SealedModem
+from protocol.modems.sealed import SealedModem
 from protocol.vehicles import BOOT_EPOCHS, LEADER, name_of
 
 LOG = logging.getLogger(__name__)
@@ -87,16 +88,22 @@ def run_vehicle(
     key: Path | None = None,
     *,
     encrypts: bool = False,
+    tap: Tap | None = None,
 ) -> None:
-    """Run one vehicle from its clock's first tick to its last, and write its files."""
+    """Run one vehicle from its clock's first tick to its last, and write its files.
+
+    What its modem says and hears goes to a tap as well.
+    """
     if store is not None:
         prepare_store(store)
     seal = None if key is None else seal_of(vehicle, key, store, encrypts=encrypts)
     sealed = voyage if seal is None else sealed_voyage(voyage)
     is_at_sea = store is not None and (store / f"{name_of(vehicle)}.sqlite").exists()
+    context = ModemContext(tap=tap) if seal is None else ModemContext(tap=tap, stamp=seal.stamp)
     modem, clock = _modem_and_clock(
-        vehicle, modem_url, clock_url, voyage, start, store, seal, must_answer=not is_at_sea
+        vehicle, modem_url, clock_url, voyage, start, store, context, must_answer=not is_at_sea
     )
+    modem = modem if seal is None else SealedModem(modem, seal)
     files = None if out is None else VehicleFiles(out, vehicle)
     try:
         starts = None if files is None else files.prepare()
@@ -241,12 +248,11 @@ def _modem_and_clock(
     voyage: Voyage,
     start: str,
     store: Path | None,
-    seal: SealedLink | None,
+    context: ModemContext,
     *,
     must_answer: bool,
 ) -> tuple[Modem, WallClock | ServedClock]:
     """Return both; on a desk a modem must answer, at sea it may be restarting as we are."""
-    context = ModemContext() if seal is None else ModemContext(stamp=seal.stamp)
     if clock_url == WALL:
         modem = open_modem(modem_url, context)
         start_utc_s, duration_s = start_time_s(start), voyage.settings.scenario.duration_s
@@ -257,18 +263,13 @@ def _modem_and_clock(
             await_identified(modem, wall.now_s, time.sleep)
         began = datetime.datetime.fromtimestamp(start_utc_s, datetime.UTC)
         print(f"the mission starts at {began:%Y-%m-%d %H:%M:%S} UTC", file=sys.stderr)
-        return _sealed(modem, seal), wall
+        return modem, wall
     if modem_url.startswith("serial:"):
         stamped = StampedModem(open_modem(modem_url, context))
-        clock = ServedClock(clock_url, vehicle, voyage.fingerprint, stamped)
-        return _sealed(stamped, seal), clock
-    line = CountedLine()
+        return stamped, ServedClock(clock_url, vehicle, voyage.fingerprint, stamped)
+    line = CountedLine(context.tap)
     modem = open_modem(modem_url, dataclasses.replace(context, tap=line.tap))
-    return _sealed(modem, seal), ServedClock(clock_url, vehicle, voyage.fingerprint, line)
-
-
-def _sealed(modem: Modem, seal: SealedLink | None) -> Modem:
-    return modem if seal is None else SealedModem(modem, seal)
+    return modem, ServedClock(clock_url, vehicle, voyage.fingerprint, line)
 
 
 def start_time_s(text: str) -> float:
@@ -347,6 +348,9 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--encrypt", action="store_true", help="with --key: hide what frames say too (AES-CCM)"
     )
+    parser.add_argument(
+        "--raw-log", type=Path, metavar="FILE", help="every byte of the modem's line; default: none"
+    )
     add_voyage_arguments(parser)
 
 
@@ -374,9 +378,19 @@ def _run(vehicle: int, arguments: argparse.Namespace, voyage: Voyage) -> None:
     if a.encrypt and a.key is None:
         raise ConfigError("--encrypt needs --key FILE, and the same at every vehicle")
     give_back_large_blocks()
-    run_vehicle(
-        vehicle, a.modem, a.clock, voyage, a.out, a.start, a.store, a.key, encrypts=a.encrypt
-    )
+    with contextlib.nullcontext() if a.raw_log is None else new_log(a.raw_log) as file:
+        run_vehicle(
+            vehicle,
+            a.modem,
+            a.clock,
+            voyage,
+            a.out,
+            a.start,
+            a.store,
+            a.key,
+            encrypts=a.encrypt,
+            tap=None if file is None else RawLog(file),
+        )
 
 
 FOLLOWER = Command(

@@ -5,9 +5,11 @@ frame that was queued, `poll` a moment at which the core had something to do or 
 a port gone.
 """
 
+import itertools
 import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TextIO
 
 from protocol.errors import ConfigError
@@ -47,6 +49,20 @@ class RawLog:
             self._file.flush()
         except OSError:
             self.unwritten += 1
+
+
+def new_log(path: Path) -> TextIO:
+    """Open a log of its own for each life of a driver: the path, or else path.1, path.2 and so on.
+
+    Raises OSError where there can be none.
+    """
+    later = (path.with_name(f"{path.name}.{life}") for life in itertools.count(1))
+    for name in itertools.chain([path], later):
+        try:
+            return name.open("x", encoding="ascii")
+        except FileExistsError:
+            continue
+    raise AssertionError("there is no last number")
 
 
 def read_log(lines: Iterable[str]) -> Iterator[LogLine]:

@@ -23,6 +23,7 @@ from host_tools.processes.sealing import seal_of
 from host_tools.processes.vehicle import start_time_s
 from protocol.codec import decode, encode
 from protocol.errors import ConfigError
+from protocol.modems.raw_log import read_log
 from protocol.packets import SealedFrame
 from tests.protocol.strategies import paper_packet
 
@@ -119,15 +120,23 @@ def line() -> Iterator[str]:
 
 
 def test_a_modem_that_does_not_answer_is_told_before_the_mission_starts(
-    line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    line: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     clock = itertools.count()
     monkeypatch.setattr(WallClock, "now_s", lambda _: next(clock) * 0.1)
     monkeypatch.setattr("time.sleep", lambda _: None)
-    assert main(["follower", "--modem", f"nanomodem://{line}", *SHORT]) == 2
-    error = capsys.readouterr().err
-    assert "no answer from a nanomodem in 2 s at 9600 baud; check its power" in error
-    assert error.count("\n") == 1
+    raw_log = tmp_path / "raw"
+    arguments = ["--modem", f"nanomodem://{line}", "--raw-log", str(raw_log), *SHORT]
+    for log in (raw_log, tmp_path / "raw.1"):
+        assert main(["follower", *arguments]) == 2
+        error = capsys.readouterr().err
+        assert "no answer from a nanomodem in 2 s at 9600 baud; check its power" in error
+        assert error.count("\n") == 1
+        with log.open() as lines:
+            assert any(one.way == "out" for one in read_log(lines))
 
 
 def test_a_modem_that_is_too_small_for_the_profile_is_told(

@@ -161,8 +161,9 @@ class ScenarioSettings(Settings):
         return 1.0 / self.tick_hz
 
     def survey_s(self, vehicle: int) -> float:
-        """Return for how long vehicle (0: leader) surveys, in seconds."""
-        return 60.0 * (self.duration_min if vehicle == 0 else self.follower_duration_min)
+        """Return for how long a vehicle (0: leader) surveys, in seconds, within the mission."""
+        followers_min = min(self.follower_duration_min, self.duration_min)
+        return 60.0 * (self.duration_min if vehicle == 0 else followers_min)
 
     def check(self) -> None:
         """Raise ConfigError when values that are right alone do not fit together."""

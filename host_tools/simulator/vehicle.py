@@ -73,7 +73,7 @@ class SimulatedVehicle:
     ) -> None:
         self.index = index
         self._scenario = scenario
-        self._survey_s = min(scenario.survey_s(index), scenario.duration_s)
+        self._survey_s = scenario.survey_s(index)
         self._path: Lawnmower | Turned = Lawnmower(
             scenario, index, np.random.default_rng([seed, index, 0])
         )

@@ -24,6 +24,7 @@ from firmware.follower.drift_filter import (
 )
 from firmware.geometry import Array
 from firmware.sound_speed import SoundProfile, horizontal_m
+from protocol.packets import SMALLEST_SIGMA_M
 from protocol.settings import setting
 
 _CHI_SQUARE_1_99, _CHI_SQUARE_2_999 = 6.6, 13.8  # shares of true innovations that lie below
@@ -260,6 +261,7 @@ class DriftCorrection:
         elif sigma_m**2 > (1.0 - _LEAST_NEWS) * alone_m2:
             self.empty += 1
             return None
+        sigma_m = max(sigma_m, SMALLEST_SIGMA_M)  # a float32 tells of any
         return AnswerSeen(time_s=time_s, ran_away_m=ran_away_m, sigma_m=sigma_m)
 
     def _alone_m2(self, time_s: float) -> float:

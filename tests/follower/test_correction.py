@@ -399,3 +399,11 @@ def test_answer_that_is_no_position_is_dropped(bad: float) -> None:
     assert not correction.receive_answer(640.0, np.zeros(2), np.array([bad, 0.0]))
     assert correction.gated == 1
     assert np.isfinite(correction.corrected(700.0, np.zeros(2))[0]).all()
+
+
+def test_answers_that_claim_to_be_certain_leave_a_covariance() -> None:
+    correction = DriftCorrection(0.0, CorrectionSettings())
+    for time_s in np.arange(10.0, 300.0, 10.0):
+        correction.receive_answer(float(time_s), np.zeros(2), np.zeros(2), 1e-19)
+    assert correction.accepted > 20
+    assert np.linalg.eigvalsh(correction.corrected(290.0, np.zeros(2))[1])[0] > 0.01**2

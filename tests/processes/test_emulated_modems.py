@@ -1,6 +1,7 @@
 """Vehicles on modems that load a packet before it starts: the core is asked a lead before."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -76,18 +77,20 @@ def test_a_follower_has_as_many_frames_for_a_slot_as_it_holds() -> None:
     assert [header.tx_second for header in headers] == [0, 0, 8, 8, 8, 8]
 
 
+PACKET = Delivery(
+    source=1,
+    destination=0,
+    t_tx_s=8.0,
+    t_rx_s=8.2,
+    t_delivered_s=11.0,
+    frame=b"",
+    fate="delivered",
+)
+
+
 def test_a_packet_of_two_frames_is_recorded_as_both_and_as_they_were_sent() -> None:
     sent, heard = bytes([1]) * 256 + bytes([2]) * 256, bytes([1]) * 256 + bytes([3]) * 256
-    packet = Delivery(
-        source=1,
-        destination=0,
-        t_tx_s=8.0,
-        t_rx_s=8.2,
-        t_delivered_s=11.0,
-        frame=heard,
-        fate="corrupt",
-        sent=sent,
-    )
+    packet = replace(PACKET, frame=heard, fate="corrupt", sent=sent)
     recorded: list[Delivery] = []
     _each_frame(packet, 0, recorded.append)
     assert [(d.frame, d.sent) for d in recorded] == [
@@ -98,15 +101,7 @@ def test_a_packet_of_two_frames_is_recorded_as_both_and_as_they_were_sent() -> N
 
 
 def test_a_packet_is_recorded_without_its_drivers_envelope() -> None:
-    packet = Delivery(
-        source=1,
-        destination=0,
-        t_tx_s=8.0,
-        t_rx_s=8.2,
-        t_delivered_s=11.0,
-        frame=b"\x01\x07" + bytes(22),
-        fate="delivered",
-    )
+    packet = replace(PACKET, frame=b"\x01\x07" + bytes(22))
     recorded: list[Delivery] = []
     _each_frame(packet, 2, recorded.append)
     assert [(d.frame, d.sent) for d in recorded] == [(bytes(22), bytes(22))]

@@ -1,6 +1,5 @@
 """A vehicle's process that comes back from its store, and takes up the mission where it was cut."""
 
-import contextlib
 import itertools
 from collections import deque
 from collections.abc import Iterator
@@ -21,8 +20,6 @@ from host_tools.processes.voyage import Voyage
 from protocol.errors import ConfigError
 from protocol.modems.base import ModemEvent, ModemStatus
 from protocol.schedule import Slots
-from protocol.seal_state import write_durably
-from protocol.vehicles import name_of
 
 PINGS_KEPT = 256
 """What the sensors hold for a computer that restarts: a minute of pings ..."""
@@ -67,21 +64,6 @@ def prepare_store(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"--store {folder}: {error.strerror}; give a folder of yours") from error
-
-
-def lasting_start_s(store: Path, vehicle: int, next_s: float, duration_s: float) -> float:
-    """Return the start, in UTC seconds, that a store's first life took as the next one.
-
-    Another mission begins where that one is over by the next start, next_s, or nobody can tell.
-    """
-    path = store / f"{name_of(vehicle)}.start"
-    with contextlib.suppress(OSError, ValueError):
-        kept_s = float(path.read_text(encoding="ascii"))
-        if 0.0 <= next_s - kept_s <= duration_s:
-            return kept_s
-    with contextlib.suppress(OSError):
-        write_durably(path, f"{next_s}\n")
-    return next_s
 
 
 def open_core(

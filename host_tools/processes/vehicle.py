@@ -35,7 +35,6 @@ from host_tools.mission import deployed
 from host_tools.processes.records import VehicleFiles
 from host_tools.processes.resume import (
     SilentModem,
-    lasting_start_s,
     missed_instants,
     navigated,
     open_core,
@@ -45,6 +44,7 @@ from host_tools.processes.resume import (
 )
 from host_tools.processes.sealing import seal_of, sealed_voyage
 from host_tools.processes.served_clock import CountedLine, ServedClock, StampedModem
+from host_tools.processes.starts import NEXT, lasting_start_s, start_time_s
 from host_tools.processes.voyage import Voyage, add_voyage_arguments, voyage_of
 from host_tools.simulator.vehicle import SimulatedVehicle
 from protocol.errors import ConfigError
@@ -57,7 +57,7 @@ from protocol.vehicles import BOOT_EPOCHS, LEADER, name_of
 
 LOG = logging.getLogger(__name__)
 STATUS_S = 60.0
-WALL, NEXT = "wall", "next"
+WALL = "wall"
 
 
 @dataclass(slots=True)
@@ -270,25 +270,6 @@ def _modem_and_clock(
     line = CountedLine(context.tap)
     modem = open_modem(modem_url, dataclasses.replace(context, tap=line.tap))
     return modem, ServedClock(clock_url, vehicle, voyage.fingerprint, line)
-
-
-def start_time_s(text: str) -> float:
-    """Return UTC seconds of a time such as 2026-05-01T12:00:00Z, or of the next whole minute.
-
-    Raises
-    ------
-    ConfigError
-        For a text that is no time, or one that is no whole second.
-    """
-    if text == NEXT:
-        return 60.0 * math.ceil(time.clock_gettime(time.CLOCK_REALTIME) / 60.0)
-    try:
-        moment = datetime.datetime.fromisoformat(text)
-    except ValueError as error:
-        raise ConfigError(f"--start is {text!r}; give UTC, such as 2026-05-01T12:00:00Z") from error
-    if moment.microsecond:
-        raise ConfigError(f"--start is {text!r}; transmissions need a whole second")
-    return (moment if moment.tzinfo else moment.replace(tzinfo=datetime.UTC)).timestamp()
 
 
 @contextlib.contextmanager

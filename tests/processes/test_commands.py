@@ -18,9 +18,8 @@ from host_tools.cli import main
 from host_tools.emulators.ptys import PseudoPort
 from host_tools.processes import vehicle as vehicle_process
 from host_tools.processes.demo import Crew
-from host_tools.processes.resume import lasting_start_s
 from host_tools.processes.sealing import seal_of
-from host_tools.processes.vehicle import start_time_s
+from host_tools.processes.starts import lasting_start_s, start_time_s
 from protocol.codec import decode, encode
 from protocol.errors import ConfigError
 from protocol.modems.raw_log import read_log

@@ -54,3 +54,18 @@ class ClosureSettings(Settings):
     gate_chi_square: float = setting(
         13.8, "1", "99.9 % of true innovations of two components pass", minimum=1.0
     )
+    drift_pairs: int = setting(
+        8, "pairs", "of a vehicle's own sub-maps that a search of their drift weighs", minimum=1
+    )
+    drift_least_pairs: int = setting(
+        5, "pairs", "fewer may repeat each other by chance: the same hill for another", minimum=1
+    )
+    drift_memory_s: float = setting(
+        900.0, "s", "of pairs that are weighed; drift wanders in longer times", minimum=60.0
+    )
+    drift_interval_s: float = setting(
+        80.0, "s", "between searches: two seconds of work each, while drift is unknown", minimum=1.0
+    )
+    drift_sigma_mps: float = setting(
+        0.04, "m/s", "a drift known better than this is left to the closures", minimum=0.0
+    )

@@ -11,7 +11,7 @@ from firmware.leader.atlas import SheetId
 from firmware.leader.closure_settings import ClosureSettings
 from firmware.leader.displacement import displaced
 from firmware.leader.ledger import Anchor
-from firmware.leader.match_jobs import MatchJob
+from firmware.leader.match_job import MatchJob
 from firmware.leader.matches import Hint, MatchOutcome
 from firmware.leader.offsets import anchor_of
 from firmware.leader.pose_graph import PoseGraph

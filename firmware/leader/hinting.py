@@ -36,14 +36,14 @@ def hint_of(
     settings, surface = problem.settings, problem.strained(surface)
     cautious = _cautious(problem, surface, relief, prior)
     evidence = ambiguity.tempered_evidence(surface, cautious, problem.correlated_cells)
-    depth_misfit = _depth_misfit(problem, surface)
-    evidence -= depth_misfit
+    against_m = depth_misfit(problem, surface, _DATUM_FLOOR_M)
+    evidence -= against_m
     found = ambiguity.posterior(surface, evidence, prior, settings.null_share)
     mean_m, covariance_m2 = ambiguity.moments(found, prior)
     root = np.linalg.cholesky(prior.covariance_m2)
     inverse = np.linalg.inv(root)
     left, axes = np.linalg.eigh(inverse @ covariance_m2 @ inverse.T)  # shares of the prior
-    contradicted = _contradicted(problem, surface, cautious, depth_misfit)
+    contradicted = _contradicted(problem, surface, cautious, against_m)
     sigmas = np.sqrt(np.maximum(left, _LEAST_SHARE))
     away = axes.T @ inverse @ _shifts_from(surface, mean_m) / sigmas[:, None]
     closed = np.array([_is_closed(away[k], away[1 - k], contradicted) for k in (0, 1)])
@@ -71,7 +71,7 @@ def _shifts_from(surface: ErrorSurface, mean_m: Array) -> Array:
     return np.stack([surface.north_m[row], surface.east_m[column]]) - mean_m[:, None]
 
 
-def _depth_misfit(problem: PairProblem, surface: ErrorSurface) -> Array:
+def depth_misfit(problem: PairProblem, surface: ErrorSurface, floor_m: float) -> Array:
     """Return what the depth offset between the sub-maps speaks against each shift, in nats.
 
     On a slope that goes on, it alone tells how far along they lie. Tide and sensor may have
@@ -80,7 +80,7 @@ def _depth_misfit(problem: PairProblem, surface: ErrorSurface) -> Array:
     told_m = problem.noise.offset_sigma_m
     if told_m == 0.0:
         return np.zeros(surface.overlap_cells.shape)
-    variance_m2 = told_m**2 + problem.strained_m2 + _DATUM_FLOOR_M**2
+    variance_m2 = told_m**2 + problem.strained_m2 + floor_m**2
     offset_m = np.where(np.isfinite(surface.residual_m2), surface.depth_offset_m, 0.0)
     return np.asarray(2.0 * np.log1p(offset_m**2 / (3.0 * variance_m2)))
 

@@ -11,10 +11,12 @@ from firmware.leader.atlas import Atlas, Sheet
 from firmware.leader.closure_log import ClosureLog, Verdict, verdict_of
 from firmware.leader.closures import Closure, closure_of, gated
 from firmware.leader.judgement import Judgement
-from firmware.leader.match_jobs import Findings, MatchJob, SheetJobs, jobs_for
+from firmware.leader.match_job import MatchJob
+from firmware.leader.match_jobs import Findings, SheetJobs, jobs_for
 from firmware.leader.nonconvexity import Doubt
 from firmware.leader.offsets import Offsets
 from firmware.leader.open_pairs import OpenPairs, sheets_of
+from firmware.leader.own_pairs import OwnPairs
 from firmware.leader.pairing import Calibrations
 from firmware.leader.pose_graph import PoseGraph
 from firmware.leader.settings import LeaderSettings
@@ -35,6 +37,7 @@ class LoopClosing:
         self._calibrations = Calibrations(settings.matching)
         self._judgement = Judgement(settings.judgement, self._calibrations)
         self._open = OpenPairs(settings.closures)
+        self._own = OwnPairs(settings.closures, settings.graph.bias_sigma_mps)
         self._sheets_judged = 0
         self._doubt: Doubt | None = None  # to go with the next matches
         self._closures: list[Closure] = []  # on which something may yet be decided
@@ -71,9 +74,10 @@ class LoopClosing:
             LOG.exception("the matches of %s cannot be made", sheet.id)
             self._counters["submaps_unmatched"] += 1
         looks = self._open.second_looks(turns, offsets, self._graph, self._calibrations)
+        search = self._own.search(sheet, self._atlas, self._graph, offsets, self._calibrations)
         doubt, self._doubt = self._doubt, None
         self.is_matching = True
-        return SheetJobs(sheet=sheet, jobs=(*jobs, *looks), doubt=doubt)
+        return SheetJobs(sheet=sheet, jobs=(*jobs, *looks), doubt=doubt, search=search)
 
     def finish(self, done: SheetJobs, findings: Findings, now_s: float) -> None:
         """Judge what the matches of one sheet found, and bring the estimate up to it.
@@ -88,6 +92,7 @@ class LoopClosing:
         for job, outcome in zip(done.jobs, findings.outcomes, strict=True):
             if outcome.reason is not None:
                 self._counters[f"match_{outcome.reason.name.lower()}"] += 1
+            self._own.note(job, outcome)
             try:
                 self._open.keep_or_settle(job, outcome, self._graph, self._judgement)
                 closure = closure_of(job, outcome, self._graph, now_s)
@@ -96,6 +101,8 @@ class LoopClosing:
                 continue
             if closure is not None:
                 found.append(closure)
+        if done.search is not None:
+            self._own.take(done.search, findings.drift, self._graph, self._judgement, self._open)
         self._closures += found
         try:
             passed = gated(found, self._graph, self._settings.closures)
@@ -113,6 +120,7 @@ class LoopClosing:
     def forget(self, before_s: float) -> None:
         """Settle the closures of a past that was composed: nothing is decided on them any more."""
         self._judgement.forget(before_s, self._graph)
+        self._own.forget(before_s)
         self._doubt = None
         known, self._closures = self._closures, []
         for closure in known:
@@ -133,6 +141,7 @@ class LoopClosing:
             **self._counters,
             **self._judgement.counters,
             **self._open.counters,
+            **self._own.counters,
             "verdicts_overwritten": self._settled.overwritten,
             "open_submaps": len(self._open),
         }

@@ -10,92 +10,49 @@ import numpy as np
 from firmware.geometry import Array
 from firmware.leader.atlas import Atlas, Sheet, SheetId, overlap_m2
 from firmware.leader.closure_settings import ClosureSettings
-from firmware.leader.displacement import Look
-from firmware.leader.drifts import NO_DRIFT, Drifts
+from firmware.leader.drift_search import DriftSearch, FoundDrift
 from firmware.leader.estimate import Estimate
-from firmware.leader.matches import MatchingSettings, MatchOutcome, NoMatch, PairSigmas
-from firmware.leader.matching import match
+from firmware.leader.match_job import MatchJob
+from firmware.leader.matches import MatchOutcome, NoMatch, PairSigmas
 from firmware.leader.nonconvexity import Doubt
 from firmware.leader.offsets import Offset, Offsets, anchor_of, corrections
 from firmware.leader.pairing import Calibrations, Side, side_of, strain_m
-from firmware.submaps import GriddedSubmap
 
 LOG = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MatchJob:
-    """Everything one match needs, so that it can run beside the loop.
-
-    Of the grids a drift (2,) was taken about the times of their sheets. The prior, (2,) and (2, 2),
-    is that of the shift to add to the target's grid. looks are those of origin and target.
-    """
-
-    origin: Sheet
-    target: Sheet
-    origin_grid: GriddedSubmap
-    target_grid: GriddedSubmap
-    origin_drift_mps: Array
-    target_drift_mps: Array
-    prior_shift_m: Array
-    prior_covariance_m2: Array
-    settings: MatchingSettings
-    sigmas: PairSigmas
-    looks: tuple[Look, Look]
-    drifts: Drifts = NO_DRIFT
-    hinted: bool = True
-
-    @property
-    def prior_sigma_m(self) -> float:
-        """How well the offset was known before the match, in its worst direction."""
-        return float(np.sqrt(np.linalg.eigvalsh(self.prior_covariance_m2)[-1]))
-
-    @property
-    def prior_radius_m(self) -> float:
-        """The radius of the circle whose area equals the prior's one-sigma ellipse."""
-        return float(max(np.linalg.det(self.prior_covariance_m2), 0.0) ** 0.25)
-
-    def run(self) -> MatchOutcome:
-        """Match the pair."""
-        return match(
-            self.origin_grid,
-            self.target_grid,
-            self.prior_shift_m,
-            self.prior_covariance_m2,
-            self.settings,
-            self.sigmas,
-            drifts=self.drifts,
-            hinted=self.hinted,
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Findings:
     """What came of a batch: an outcome of each match, and which closures in doubt are false.
 
-    The latter is None where none were in doubt, or the doubt has no solution.
+    The latter is None where none were in doubt, or the doubt has no solution; drift is what a
+    search found, if there was one.
     """
 
     outcomes: list[MatchOutcome]
     false_closures: list[int] | None = None
+    drift: FoundDrift | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SheetJobs:
     """The matches of one new sub-map, and second looks; run all, hand the findings to `finish`.
 
-    Where closures contradict each other, they come as a doubt beside the matches.
+    Where closures contradict each other, they come as a doubt beside the matches; where a vehicle's
+    drift is not known, a search for it does.
     """
 
     sheet: Sheet
     jobs: tuple[MatchJob, ...]
     doubt: Doubt | None = None
+    search: DriftSearch | None = None
 
     def run(self) -> Findings:
         """Run all matches, in order; never raises: one that fails has no match for a reason."""
         return Findings(
             outcomes=[_outcome_of(job) for job in self.jobs],
             false_closures=None if self.doubt is None else _false_by(self.doubt),
+            drift=None if self.search is None else _found_by(self.search),
         )
 
 
@@ -112,6 +69,14 @@ def _false_by(doubt: Doubt) -> list[int] | None:
         return doubt.run()
     except Exception:
         LOG.exception("a doubt failed")
+        return None
+
+
+def _found_by(search: DriftSearch) -> FoundDrift | None:
+    try:
+        return search.run()
+    except Exception:
+        LOG.exception("a search for a drift failed")
         return None
 
 
@@ -163,6 +128,16 @@ def jobs_again(
         learn=False,
         have_hints={known.origin.id for known, _, hint in partners if hint is not None},
     )
+
+
+def jobs_of(
+    offsets: list[Offset], estimate: Estimate, settings: ClosureSettings, calibrations: Calibrations
+) -> tuple[MatchJob, ...]:
+    """Return the matches of pairs as the estimate has them now, whatever came of them before."""
+    jobs = list[MatchJob]()
+    for offset in offsets:
+        jobs += _jobs(offset.target, [offset], estimate, settings, calibrations, learn=False)
+    return tuple(jobs)
 
 
 def _without_hint(offset: Offset, hint: int, estimate: Estimate) -> Offset:

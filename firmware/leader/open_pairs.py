@@ -14,7 +14,8 @@ from firmware.leader.atlas import Atlas, Sheet, SheetId
 from firmware.leader.closure_settings import ClosureSettings
 from firmware.leader.closures import enter_hint
 from firmware.leader.judgement import Judgement
-from firmware.leader.match_jobs import MatchJob, jobs_again
+from firmware.leader.match_job import MatchJob
+from firmware.leader.match_jobs import jobs_again
 from firmware.leader.matches import MatchOutcome, NoMatch
 from firmware.leader.offsets import Offsets
 from firmware.leader.pairing import Calibrations
@@ -169,6 +170,17 @@ class OpenPairs:
                 self._heard[number] = ends
             if len(self._heard) > _HEARD:
                 self._heard.popitem(last=False)
+
+    def take_back(
+        self, origin: SheetId, target: SheetId, graph: PoseGraph, judgement: Judgement
+    ) -> None:
+        """Let the hint of a pair go: it was told together with others. The pair stays open."""
+        hint = self.hint(origin, target)
+        if hint is not None:
+            judgement.drop_hint(hint, graph)
+            self._heard.pop(hint, None)
+            pairs = self._of[target]
+            pairs[origin] = replace(pairs[origin], hint=None)
 
     def _heard_alike(self, ends: Ends, graph: PoseGraph) -> int:
         """Return how many hints of neighbours of a pair's sub-maps are believed."""

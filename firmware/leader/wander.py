@@ -54,6 +54,41 @@ def reckoned_m2(
     return start_m**2 + drifted + walk**2 * duration_s**3 / 3
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeanDrift:
+    """What the mean drift over a time says of dead reckoning within it, each axis.
+
+    variance in (m/s)^2 is that of the mean drift; a drift leads dead reckoning astray by gain_s
+    times itself within the span, give or take left_m2.
+    """
+
+    variance: float
+    gain_s: float
+    left_m2: float
+
+
+def mean_drift(
+    span_s: tuple[float, float], duration_s: float, wandering: Wandering, drift_mps: float
+) -> MeanDrift:
+    """Return what the mean drift of a time, counted from zero, says of a span (begin, end) in it.
+
+    drift_mps is the sigma of drift when it began, from where it walks.
+    """
+    begin_s, end_s = span_s
+    length_s = end_s - begin_s
+    noise_m2ps, walk, drift = wandering.noise**2, wandering.walk**2, drift_mps**2
+    both_s3 = duration_s * (end_s**2 - begin_s**2) / 2 - (end_s**3 - begin_s**3) / 6
+    whole_m2 = reckoned_m2(duration_s, wandering.noise, wandering.walk, drift_mps=drift_mps)
+    both_m2 = drift * length_s * duration_s + walk * both_s3 + noise_m2ps * length_s
+    span_m2 = drift * length_s**2 + walk * length_s**2 * (begin_s + length_s / 3)
+    span_m2 += noise_m2ps * length_s
+    return MeanDrift(
+        variance=whole_m2 / duration_s**2,
+        gain_s=both_m2 * duration_s / whole_m2,
+        left_m2=max(span_m2 - both_m2**2 / whole_m2, 0.0),
+    )
+
+
 def bridged_m2(duration_s: float, noise: float, walk: float) -> float:
     """Return the variance, each axis, of dead reckoning between two times whose drift is given.
 

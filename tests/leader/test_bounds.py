@@ -14,7 +14,8 @@ from firmware.leader.closures import Closure, Stage
 from firmware.leader.coverage import CoverageSettings, redundant
 from firmware.leader.judgement import Judgement, JudgementSettings
 from firmware.leader.ledger import Anchor
-from firmware.leader.match_jobs import MatchJob, SheetJobs
+from firmware.leader.match_job import MatchJob
+from firmware.leader.match_jobs import SheetJobs
 from firmware.leader.matches import MatchingSettings, MatchOutcome, NoMatch
 from firmware.leader.pairing import Calibrations
 from firmware.leader.shelf import MemoryShelf, packed, unpacked

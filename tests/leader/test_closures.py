@@ -11,7 +11,7 @@ from firmware.leader.closure_settings import ClosureSettings
 from firmware.leader.closures import Closure, Stage, closure_of, enter_hint, gated
 from firmware.leader.displacement import Look
 from firmware.leader.graph_settings import GraphSettings
-from firmware.leader.match_jobs import MatchJob
+from firmware.leader.match_job import MatchJob
 from firmware.leader.matches import ANY_PAIR, Hint, Match, MatchingSettings, MatchOutcome, NoMatch
 from firmware.leader.pose_graph import PoseGraph
 from firmware.submaps import GriddedSubmap, Track

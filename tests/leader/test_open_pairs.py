@@ -15,7 +15,8 @@ from firmware.leader.estimate import Estimate
 from firmware.leader.judgement import Judgement, JudgementSettings
 from firmware.leader.ledger import Anchor
 from firmware.leader.loop_closing import LoopClosing
-from firmware.leader.match_jobs import MatchJob, jobs_again
+from firmware.leader.match_job import MatchJob
+from firmware.leader.match_jobs import jobs_again
 from firmware.leader.matches import ANY_PAIR, Hint, Match, MatchingSettings, MatchOutcome, NoMatch
 from firmware.leader.offsets import Offsets
 from firmware.leader.open_pairs import OpenPairs

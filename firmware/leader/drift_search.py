@@ -1,0 +1,225 @@
+"""The drift that a vehicle's own sub-maps share, where no pair of them tells it alone.
+
+Where relief is faint, a pair of sub-maps fits at many shifts. Yet one drift moves all pairs of a
+vehicle, each by as much as the time between its two passes: drifts are tried, and what every pair
+says of the shift that a drift implies is summed. What is found is told as the hint of one pair.
+"""
+
+import itertools
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from firmware.geometry import Array
+from firmware.leader import ambiguity
+from firmware.leader.ambiguity import Relief
+from firmware.leader.atlas import overlap_m2
+from firmware.leader.drifts import AGE_S
+from firmware.leader.hinting import depth_misfit
+from firmware.leader.match_job import MatchJob
+from firmware.leader.matches import Hint
+from firmware.leader.pair_problem import PairProblem, pair_problem
+from firmware.leader.screening import ErrorSurface
+from firmware.leader.wander import MeanDrift, Wandering, mean_drift
+from firmware.leader.warping import remove_drift
+from firmware.submaps import GriddedSubmap
+
+_STEP_MPS = 0.02  # between drifts that are tried
+_STEPS_EACH = 5  # along each axis, that share a surface: their strain differs by half a metre
+_REACH_SIGMAS = 2.25  # of the drift before anything is known, that are tried
+_TOLERANCE = 1.2  # of the best misfit: a pair tells a region of shifts, not one
+_LEAST_MISFIT = 1.0  # of coarse cells, whose noise has been averaged
+_MOST_MISFIT = 3.0  # of the best shift; a pair that fits worse errs in a way that no drift explains
+_DATUM_FLOOR_M = 0.03  # of a depth offset between two passes
+_GAINED = 0.25  # share of the variance, in the worse direction, up to which a drift counts as found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FoundDrift:
+    """What a search found, as a hint of the pair whose two passes lie farthest apart in time."""
+
+    job: MatchJob
+    hint: Hint
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DriftSearch:
+    """A search for the mean drift of one chain: its own pairs, at least one, and what is known.
+
+    drift_sigma_mps is how large drift may be, each axis, before anything tells of it.
+    """
+
+    jobs: tuple[MatchJob, ...]
+    wandering: Wandering
+    drift_sigma_mps: float
+
+    def run(self) -> FoundDrift | None:
+        """Return what all pairs together say, None where that is too little."""
+        begin_s = min(job.origin.time_s for job in self.jobs)
+        end_s = max(job.target.time_s for job in self.jobs)
+        model = [
+            mean_drift(
+                (job.origin.time_s - begin_s, job.target.time_s - begin_s),
+                end_s - begin_s,
+                self.wandering,
+                self.drift_sigma_mps,
+            )
+            for job in self.jobs
+        ]
+        prior_m2ps2 = model[0].variance
+        drifts_mps = _tried(_REACH_SIGMAS * np.sqrt(prior_m2ps2))
+        log_mass = -0.5 * np.add.outer(drifts_mps**2, drifts_mps**2) / prior_m2ps2
+        for job, known in zip(self.jobs, model, strict=True):
+            log_mass += _evidence(job, known, drifts_mps)
+        mean_mps, covariance = _moments(drifts_mps, log_mass)
+        if np.linalg.eigvalsh(covariance)[-1] > _GAINED * prior_m2ps2:
+            return None
+        told = np.linalg.inv(np.linalg.inv(covariance) - np.eye(2) / prior_m2ps2)
+        farthest = int(np.argmax([known.gain_s for known in model]))
+        job, known = self.jobs[farthest], model[farthest]
+        return FoundDrift(
+            job=job,
+            hint=Hint(
+                shift_m=-known.gain_s * mean_mps,
+                covariance_m2=known.gain_s**2 * told + known.left_m2 * np.eye(2),
+            ),
+        )
+
+
+def _tried(reach_mps: float) -> Array:
+    """Return the drifts along one axis, (D,), in whole groups that share a surface."""
+    groups = int(np.ceil(reach_mps / _STEP_MPS / _STEPS_EACH - 0.5))
+    each_way = groups * _STEPS_EACH + _STEPS_EACH // 2
+    return np.asarray(_STEP_MPS * np.arange(-each_way, each_way + 1.0))
+
+
+def _evidence(job: MatchJob, known: MeanDrift, drifts_mps: Array) -> Array:
+    """Return the log evidence (D, D) of one pair for every drift, zero where nothing overlaps."""
+    found = np.zeros((drifts_mps.size, drifts_mps.size))
+    origin, target = coarse(job.origin_grid), coarse(job.target_grid)
+    strain_m = AGE_S * _STEP_MPS * _STEPS_EACH / np.sqrt(6.0)
+    sigmas = replace(job.sigmas, strain_m=strain_m)
+    problem = pair_problem(origin, target, job.settings, sigmas)
+    if problem is None:
+        return found
+    surfaces = dict[tuple[int, int], ErrorSurface]()
+    groups = range(drifts_mps.size // _STEPS_EACH)
+    for i, j in itertools.product(groups, groups):
+        drift_mps = drifts_mps[np.array([i, j]) * _STEPS_EACH + _STEPS_EACH // 2]
+        if np.hypot(*drift_mps) > drifts_mps[-1]:
+            continue
+        surface = _surface(job, problem, (origin, target), drift_mps, known)
+        if surface is not None:
+            surfaces[i, j] = surface
+    least = min((float(surface.misfit.min()) for surface in surfaces.values()), default=np.inf)
+    if least > _MOST_MISFIT:
+        return found
+    scale = max(_TOLERANCE * least, _LEAST_MISFIT)
+    relief = Relief(
+        background=np.inf,
+        information_per_cell=2.0 * problem.information(scale, strain_m=strain_m),
+        coherent_cells=job.settings.coherent_overlap_m2 / origin.cell_m**2,
+        noise_scale=scale,
+    )
+    for (i, j), surface in surfaces.items():
+        rows = slice(i * _STEPS_EACH, (i + 1) * _STEPS_EACH)
+        columns = slice(j * _STEPS_EACH, (j + 1) * _STEPS_EACH)
+        shifts_m = -known.gain_s * np.stack(
+            np.meshgrid(drifts_mps[rows], drifts_mps[columns], indexing="ij")
+        )
+        told = ambiguity.tempered_evidence(surface, relief, problem.correlated_cells)
+        told -= depth_misfit(problem, surface, _DATUM_FLOOR_M)
+        found[rows, columns] = _averaged(surface, np.maximum(told, 0.0), known.left_m2, shifts_m)
+    return found
+
+
+def _surface(
+    job: MatchJob,
+    problem: PairProblem,
+    grids: tuple[GriddedSubmap, GriddedSubmap],
+    drift_mps: Array,
+    known: MeanDrift,
+) -> ErrorSurface | None:
+    """Return the error surface of a pair rid of a drift (2,), None where it would not overlap."""
+    shift_m = -known.gain_s * drift_mps
+    half_m = known.gain_s * _STEP_MPS * _STEPS_EACH / 2 + 3.0 * np.sqrt(known.left_m2)
+    around_m = shift_m + half_m * np.array([[0, 0], [1, 1], [1, -1], [-1, 1], [-1, -1]])
+    if overlap_m2(job.origin, job.target, around_m).max() < job.settings.minimum_overlap_m2:
+        return None
+    sides = zip(
+        grids,
+        (job.origin_drift_mps, job.target_drift_mps),
+        (job.origin.time_s, job.target.time_s),
+        strict=True,
+    )
+    warped = [_without(grid, drift_mps - known_mps, time_s) for grid, known_mps, time_s in sides]
+    whole = problem.surface_of(*warped)
+    if whole is None:
+        return None
+    north = np.flatnonzero(np.abs(whole.north_m - shift_m[0]) <= half_m)
+    east = np.flatnonzero(np.abs(whole.east_m - shift_m[1]) <= half_m)
+    if north.size < 2 or east.size < 2:
+        return None
+    near = whole.window(slice(north[0], north[-1] + 1), slice(east[0], east[-1] + 1))
+    return problem.strained(near) if np.isfinite(near.residual_m2).any() else None
+
+
+def _without(grid: GriddedSubmap, drift_mps: Array, time_s: float) -> GriddedSubmap:
+    return remove_drift(grid, float(drift_mps[0]), float(drift_mps[1]), time_s, nearest=True)
+
+
+def _averaged(surface: ErrorSurface, evidence: Array, left_m2: float, shifts_m: Array) -> Array:
+    """Return the log of the mean of exp(evidence) about shifts (2, ...), as sure as left_m2."""
+    cell_m = float(surface.north_m[1] - surface.north_m[0])
+    mass = np.exp(np.where(np.isfinite(surface.residual_m2), evidence, 0.0))
+    blurred = ndimage.gaussian_filter(mass, np.sqrt(left_m2) / cell_m, mode="constant", cval=1.0)
+    first_m = np.array([surface.north_m[0], surface.east_m[0]]).reshape(2, 1, 1)
+    at = (shifts_m - first_m) / cell_m
+    means = ndimage.map_coordinates(blurred, at, order=1, mode="constant", cval=1.0)
+    return np.asarray(np.log(means))
+
+
+def _moments(drifts_mps: Array, log_mass: Array) -> tuple[Array, Array]:
+    """Return mean (2,) and covariance (2, 2) of a drift of so much mass (D, D)."""
+    mass = np.exp(log_mass - log_mass.max())
+    mass /= mass.sum()
+    mean = np.array([mass.sum(axis=1) @ drifts_mps, mass.sum(axis=0) @ drifts_mps])
+    north, east = drifts_mps - mean[0], drifts_mps - mean[1]
+    crossed = float(north @ mass @ east)
+    second = [
+        [mass.sum(axis=1) @ north**2, crossed],
+        [crossed, mass.sum(axis=0) @ east**2],
+    ]
+    return mean, np.array(second) + np.eye(2) * _STEP_MPS**2 / 12.0
+
+
+def coarse(grid: GriddedSubmap) -> GriddedSubmap:
+    """Return a grid of cells twice as large, each the mean of those known of four.
+
+    Noise of soundings is averaged; a reconstruction's is alike in neighbours.
+    """
+    rows, columns = (n // 2 * 2 for n in grid.depth_m.shape)
+    known = np.isfinite(grid.depth_m) & np.isfinite(grid.variance_m2)
+    count = _blocks(known, rows, columns).sum(axis=(1, 3))
+
+    def mean(values: Array, of: NDArray[np.bool_]) -> Array:
+        total = _blocks(np.where(of, values, 0.0), rows, columns).sum(axis=(1, 3))
+        number = _blocks(of, rows, columns).sum(axis=(1, 3))
+        return np.where(number > 0, total / np.maximum(number, 1), np.nan)
+
+    variance_m2 = mean(grid.variance_m2, known)
+    return replace(
+        grid,
+        north0_m=grid.north0_m + grid.cell_m / 2.0,
+        east0_m=grid.east0_m + grid.cell_m / 2.0,
+        cell_m=2.0 * grid.cell_m,
+        depth_m=mean(grid.depth_m, known),
+        variance_m2=variance_m2 if grid.reconstructed else variance_m2 / np.maximum(count, 1),
+        time_s=mean(grid.time_s, known & np.isfinite(grid.time_s)),
+    )
+
+
+def _blocks(values: NDArray[np.generic], rows: int, columns: int) -> NDArray[np.generic]:
+    return values[:rows, :columns].reshape(rows // 2, 2, columns // 2, 2)

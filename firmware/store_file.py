@@ -12,7 +12,7 @@ from typing import Any
 
 from protocol.errors import ConfigError, FathomError
 
-SCHEMA = "12"
+SCHEMA = "13"
 _TABLES = """
 CREATE TABLE about (name TEXT PRIMARY KEY, checksum INTEGER NOT NULL, value TEXT NOT NULL);
 CREATE TABLE inputs (number INTEGER PRIMARY KEY, checksum INTEGER NOT NULL, body BLOB NOT NULL);

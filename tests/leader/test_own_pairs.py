@@ -1,0 +1,179 @@
+"""Pairs of one vehicle that gave no closure are weighed together while its drift is unknown."""
+
+import dataclasses
+from unittest.mock import MagicMock
+
+import numpy as np
+import pytest
+
+from firmware.leader import own_pairs
+from firmware.leader.atlas import Atlas, Sheet, SheetId
+from firmware.leader.closure_settings import ClosureSettings
+from firmware.leader.displacement import Look
+from firmware.leader.drift_search import DriftSearch, FoundDrift
+from firmware.leader.judgement import Judgement, JudgementSettings
+from firmware.leader.match_job import MatchJob
+from firmware.leader.matches import ANY_PAIR, Hint, Match, MatchingSettings, MatchOutcome, NoMatch
+from firmware.leader.offsets import Offsets
+from firmware.leader.open_pairs import OpenPairs
+from firmware.leader.own_pairs import OwnPairs
+from firmware.leader.pairing import Calibrations
+from firmware.leader.pose_graph import PoseGraph
+from tests.leader.sheets import northward, sheet_at
+
+NOTHING = MatchOutcome(match=None, reason=NoMatch.UNSETTLED)
+SETTINGS = ClosureSettings(drift_least_pairs=2, drift_sigma_mps=1e-3)
+LOOK = Look(
+    vehicle=0,
+    starboard=np.array([0.0, 1.0]),
+    altitude_m=40.0,
+    half_width_m=70.0,
+    errors=np.zeros(2),
+    covariance=np.zeros((2, 2)),
+)
+
+
+def _sheet(submap: int, vehicle: int = 0) -> Sheet:
+    """Return the sheet of so many times forty seconds."""
+    sheet = sheet_at(submap, 40.0 * submap)
+    return dataclasses.replace(
+        sheet, id=SheetId(vehicle=vehicle, boot_epoch=0, submap=submap), time_s=40.0 * submap
+    )
+
+
+def _job(origin: Sheet, target: Sheet) -> MatchJob:
+    return MatchJob(
+        origin=origin,
+        target=target,
+        origin_grid=origin.grid,
+        target_grid=target.grid,
+        origin_drift_mps=np.zeros(2),
+        target_drift_mps=np.zeros(2),
+        prior_shift_m=np.zeros(2),
+        prior_covariance_m2=np.diag([20.0, 20.0]) ** 2,
+        settings=MatchingSettings(),
+        sigmas=ANY_PAIR,
+        looks=(LOOK, LOOK),
+    )
+
+
+@pytest.fixture
+def graph() -> PoseGraph:
+    return northward()
+
+
+@pytest.fixture
+def atlas() -> Atlas:
+    atlas = Atlas(16)
+    for submap in range(6):
+        atlas.add(_sheet(submap))
+    return atlas
+
+
+@pytest.fixture
+def own() -> OwnPairs:
+    """Return two pairs of a chain, the second of which spans the longer time."""
+    own = OwnPairs(SETTINGS, 0.2)
+    for first, second in ((1, 3), (0, 4)):
+        own.note(_job(_sheet(first), _sheet(second)), NOTHING)
+    return own
+
+
+@pytest.fixture
+def calibrations() -> Calibrations:
+    return Calibrations(MatchingSettings())
+
+
+def _searched(
+    own: OwnPairs, submap: int, atlas: Atlas, graph: PoseGraph, calibrations: Calibrations
+) -> DriftSearch | None:
+    return own.search(_sheet(submap), atlas, graph, Offsets(graph), calibrations)
+
+
+def _spans(search: DriftSearch | None) -> set[tuple[int, int]]:
+    assert search is not None
+    return {(job.origin.id.submap, job.target.id.submap) for job in search.jobs}
+
+
+def test_pairs_without_a_closure_are_searched_again_after_a_while(
+    own: OwnPairs, atlas: Atlas, graph: PoseGraph, calibrations: Calibrations
+) -> None:
+    search = _searched(own, 4, atlas, graph, calibrations)
+    assert _spans(search) == {(1, 3), (0, 4)}
+    assert search is not None
+    assert search.wandering == graph.wandering
+    assert _searched(own, 5, atlas, graph, calibrations) is None  # forty seconds later
+    assert _spans(_searched(own, 6, atlas, graph, calibrations)) == {(1, 3), (0, 4)}
+    assert own.counters["drift_searches"] == 2
+
+
+def test_known_drift_is_left_to_closures(
+    atlas: Atlas, graph: PoseGraph, calibrations: Calibrations
+) -> None:
+    own = OwnPairs(dataclasses.replace(SETTINGS, drift_sigma_mps=1.0), 0.2)
+    for first, second in ((1, 3), (0, 4)):
+        own.note(_job(_sheet(first), _sheet(second)), NOTHING)
+    assert _searched(own, 4, atlas, graph, calibrations) is None
+
+
+def test_only_pairs_of_one_chain_that_did_not_close_are_weighed(
+    own: OwnPairs, atlas: Atlas, graph: PoseGraph, calibrations: Calibrations
+) -> None:
+    closed = MatchOutcome(match=MagicMock(Match), reason=None)
+    own.note(_job(_sheet(0), _sheet(3)), closed)
+    own.note(_job(_sheet(0, vehicle=1), _sheet(3)), NOTHING)
+    own.note(_job(_sheet(4), _sheet(0)), NOTHING)  # the other way round: it is known
+    assert _spans(_searched(own, 4, atlas, graph, calibrations)) == {(1, 3), (0, 4)}
+
+
+def test_pairs_of_the_same_soundings_are_weighed_once(
+    own: OwnPairs, atlas: Atlas, graph: PoseGraph, calibrations: Calibrations
+) -> None:
+    near = dataclasses.replace(_sheet(5), time_s=170.0)
+    atlas.add(near)
+    own.note(_job(_sheet(0), near), NOTHING)
+    assert _spans(_searched(own, 4, atlas, graph, calibrations)) == {(1, 3), (0, 4)}
+
+
+def test_what_is_forgotten_is_weighed_no_more(
+    own: OwnPairs, atlas: Atlas, graph: PoseGraph, calibrations: Calibrations
+) -> None:
+    own.forget(100.0)
+    assert _searched(own, 4, atlas, graph, calibrations) is not None
+    own.forget(1000.0)
+    assert _searched(own, 9, atlas, graph, calibrations) is None
+
+
+def _active(graph: PoseGraph) -> set[int]:
+    return {number for number in range(graph.records) if graph.is_active(number)}
+
+
+def test_what_is_found_takes_the_place_of_earlier_hints(
+    own: OwnPairs, graph: PoseGraph, calibrations: Calibrations
+) -> None:
+    judgement, open_pairs = Judgement(JudgementSettings(), calibrations), OpenPairs(SETTINGS)
+    before, job = _active(graph), _job(_sheet(0), _sheet(4))
+    hint = Hint(shift_m=np.array([3.0, -2.0]), covariance_m2=25.0 * np.eye(2))
+    ambiguous = MatchOutcome(match=None, reason=NoMatch.AMBIGUOUS, hint=hint)
+    open_pairs.keep_or_settle(job, ambiguous, graph, judgement)
+    assert _active(graph) == before | {len(before)}
+    search = DriftSearch(jobs=(job,), wandering=graph.wandering, drift_sigma_mps=0.2)
+    for taken in range(1, 3):
+        own.take(search, FoundDrift(job=job, hint=hint), graph, judgement, open_pairs)
+        assert _active(graph) == before | {len(before) + taken}
+        assert open_pairs.hint(job.origin.id, job.target.id) is None
+    own.take(search, None, graph, judgement, open_pairs)
+    assert _active(graph) == before | {len(before) + 2}
+    assert own.counters["drifts_found"] == 2
+
+
+def test_search_that_cannot_be_made_is_counted(
+    own: OwnPairs,
+    atlas: Atlas,
+    graph: PoseGraph,
+    calibrations: Calibrations,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(own_pairs, "jobs_of", MagicMock(side_effect=ValueError))
+    assert _searched(own, 4, atlas, graph, calibrations) is None
+    assert own.counters["drift_searches_raised"] == 1

@@ -10,12 +10,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import linalg, ndimage
 
 from firmware.geometry import Array
 from firmware.leader import ambiguity
+from firmware.leader.alignment import align
 from firmware.leader.ambiguity import Relief
 from firmware.leader.atlas import overlap_m2
+from firmware.leader.design import curvature, design_of
 from firmware.leader.drifts import AGE_S
 from firmware.leader.hinting import depth_misfit
 from firmware.leader.match_job import MatchJob
@@ -30,9 +32,15 @@ _STEP_MPS = 0.02  # between drifts that are tried
 _STEPS_EACH = 5  # along each axis, that share a surface: their strain differs by half a metre
 _REACH_SIGMAS = 2.25  # of the drift before anything is known, that are tried
 _TOLERANCE = 1.2  # of the best misfit: a pair tells a region of shifts, not one
-_LEAST_MISFIT = 1.0  # of coarse cells, whose noise has been averaged
+_LEAST_MISFIT = (
+    1.3  # of coarse cells: chance alone makes a tenth of the difference between two shifts
+)
 _MOST_MISFIT = 3.0  # of the best shift; a pair that fits worse errs in a way that no drift explains
 _DATUM_FLOOR_M = 0.03  # of a depth offset between two passes
+_LEAST_SHARED = (
+    0.4  # of slopes, by both passes: seabed has half and more of them, a ridge none along it
+)
+_TINY = 1e-9
 _GAINED = 0.25  # share of the variance, in the worse direction, up to which a drift counts as found
 
 
@@ -76,16 +84,30 @@ class DriftSearch:
         mean_mps, covariance = _moments(drifts_mps, log_mass)
         if np.linalg.eigvalsh(covariance)[-1] > _GAINED * prior_m2ps2:
             return None
-        told = np.linalg.inv(np.linalg.inv(covariance) - np.eye(2) / prior_m2ps2)
+        if self._shared_slopes(model, mean_mps) < _LEAST_SHARED:
+            return None
+        likely = np.linalg.inv(np.linalg.inv(covariance) - np.eye(2) / prior_m2ps2)
         farthest = int(np.argmax([known.gain_s for known in model]))
         job, known = self.jobs[farthest], model[farthest]
+        left_m2 = known.left_m2 + job.settings.hint_floor_m**2
         return FoundDrift(
             job=job,
             hint=Hint(
                 shift_m=-known.gain_s * mean_mps,
-                covariance_m2=known.gain_s**2 * told + known.left_m2 * np.eye(2),
+                covariance_m2=known.gain_s**2 * likely + left_m2 * np.eye(2),
             ),
         )
+
+    def _shared_slopes(self, model: list[MeanDrift], drift_mps: Array) -> float:
+        """Return the share of slopes that both passes have, in the direction of the least of it.
+
+        Along a ridge that goes on as far as sub-maps overlap slopes are noise, which they do not
+        share: that they overlap at all is then all that is known.
+        """
+        both, smooth = np.sum(
+            [_slopes(*each, drift_mps) for each in zip(self.jobs, model, strict=True)], axis=0
+        )
+        return float(linalg.eigvalsh(both, smooth + _TINY * np.eye(2))[0])
 
 
 def _tried(reach_mps: float) -> Array:
@@ -148,14 +170,7 @@ def _surface(
     around_m = shift_m + half_m * np.array([[0, 0], [1, 1], [1, -1], [-1, 1], [-1, -1]])
     if overlap_m2(job.origin, job.target, around_m).max() < job.settings.minimum_overlap_m2:
         return None
-    sides = zip(
-        grids,
-        (job.origin_drift_mps, job.target_drift_mps),
-        (job.origin.time_s, job.target.time_s),
-        strict=True,
-    )
-    warped = [_without(grid, drift_mps - known_mps, time_s) for grid, known_mps, time_s in sides]
-    whole = problem.surface_of(*warped)
+    whole = problem.surface_of(*_warped(job, grids, drift_mps))
     if whole is None:
         return None
     north = np.flatnonzero(np.abs(whole.north_m - shift_m[0]) <= half_m)
@@ -166,8 +181,33 @@ def _surface(
     return problem.strained(near) if np.isfinite(near.residual_m2).any() else None
 
 
-def _without(grid: GriddedSubmap, drift_mps: Array, time_s: float) -> GriddedSubmap:
-    return remove_drift(grid, float(drift_mps[0]), float(drift_mps[1]), time_s, nearest=True)
+def _slopes(job: MatchJob, known: MeanDrift, drift_mps: Array) -> Array:
+    """Return the squares of a pair's slopes by both passes and by their mean, (2, 2, 2).
+
+    Both are told per cell's noise, for the shift that a drift (2,) implies.
+    """
+    grids = coarse(job.origin_grid), coarse(job.target_grid)
+    problem = pair_problem(*_warped(job, grids, drift_mps), job.settings, job.sigmas)
+    if problem is None:
+        return np.zeros((2, 2, 2))
+    shift_m = -known.gain_s * drift_mps
+    field = align(problem.reference, problem.query, problem.fields(), shift_m, problem.noise)
+    if field is None:
+        return np.zeros((2, 2, 2))
+    design = design_of(field, problem.noise)
+    smooth = design.columns[:2]
+    squares = np.stack([curvature(field, design)[:2, :2], (smooth / field.variance_m2) @ smooth.T])
+    return np.asarray(known.gain_s**2 * squares)
+
+
+def _warped(
+    job: MatchJob, grids: tuple[GriddedSubmap, GriddedSubmap], drift_mps: Array
+) -> tuple[GriddedSubmap, GriddedSubmap]:
+    """Return both grids of a pair, from which its own drifts were taken, rid of a drift (2,)."""
+    north_mps, east_mps = (drift_mps - job.origin_drift_mps).tolist()
+    origin = remove_drift(grids[0], north_mps, east_mps, job.origin.time_s, nearest=True)
+    north_mps, east_mps = (drift_mps - job.target_drift_mps).tolist()
+    return origin, remove_drift(grids[1], north_mps, east_mps, job.target.time_s, nearest=True)
 
 
 def _averaged(surface: ErrorSurface, evidence: Array, left_m2: float, shifts_m: Array) -> Array:

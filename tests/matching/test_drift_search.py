@@ -44,6 +44,15 @@ class Swell:
         return np.asarray(40.0 + self._height_m * np.sin(waves + self._phases).sum(axis=-1))
 
 
+class Ridges(Swell):
+    """A seabed whose waves all run one way, for ever."""
+
+    def __init__(self, rng: np.random.Generator, way_rad: float) -> None:
+        super().__init__(rng, height_m=0.4)
+        towards = np.array([np.cos(way_rad), np.sin(way_rad)])
+        self._waves = np.outer(towards, np.hypot(*self._waves))
+
+
 def _sheet(submap: int, seabed: Swell, rng: np.random.Generator) -> Sheet:
     """Return a sub-map, by dead reckoning, of a line north and of one back beside it."""
     times_s = SUBMAP_S * submap + np.arange(SUBMAP_S + 1.0)
@@ -126,6 +135,13 @@ def test_drift_is_found_that_no_pair_tells(seed: int) -> None:
 def test_level_seabed_tells_no_drift() -> None:
     rng = np.random.default_rng(1)
     assert _search(_jobs(Swell(rng, height_m=0.0), rng)).run() is None
+
+
+@pytest.mark.parametrize(("seed", "way_rad"), [(0, 2.3), (1, 2.3), (3, 0.4), (3, 2.3)])
+def test_ridges_that_go_on_tell_no_drift(seed: int, way_rad: float) -> None:
+    """That sub-maps overlap at all would tell how far along it they lie: forty metres off."""
+    rng = np.random.default_rng(seed)
+    assert _search(_jobs(Ridges(rng, way_rad), rng)).run() is None
 
 
 def test_pairs_that_fit_nowhere_tell_no_drift() -> None:

@@ -32,14 +32,10 @@ _STEP_MPS = 0.02  # between drifts that are tried
 _STEPS_EACH = 5  # along each axis, that share a surface: their strain differs by half a metre
 _REACH_SIGMAS = 2.25  # of the drift before anything is known, that are tried
 _TOLERANCE = 1.2  # of the best misfit: a pair tells a region of shifts, not one
-_LEAST_MISFIT = (
-    1.3  # of coarse cells: chance alone makes a tenth of the difference between two shifts
-)
+_LEAST_MISFIT = 1.3  # of coarse cells: by chance one shift has a tenth more than the next
 _MOST_MISFIT = 3.0  # of the best shift; a pair that fits worse errs in a way that no drift explains
 _DATUM_FLOOR_M = 0.03  # of a depth offset between two passes
-_LEAST_SHARED = (
-    0.4  # of slopes, by both passes: seabed has half and more of them, a ridge none along it
-)
+_LEAST_SHARED = 0.4  # of slopes: half and more on seabed that tells, next to none along a ridge
 _TINY = 1e-9
 _GAINED = 0.25  # share of the variance, in the worse direction, up to which a drift counts as found
 
@@ -76,15 +72,16 @@ class DriftSearch:
             )
             for job in self.jobs
         ]
+        pairs = [_Pair(job, known) for job, known in zip(self.jobs, model, strict=True)]
         prior_m2ps2 = model[0].variance
         drifts_mps = _tried(_REACH_SIGMAS * np.sqrt(prior_m2ps2))
         log_mass = -0.5 * np.add.outer(drifts_mps**2, drifts_mps**2) / prior_m2ps2
-        for job, known in zip(self.jobs, model, strict=True):
-            log_mass += _evidence(job, known, drifts_mps)
+        for pair in pairs:
+            log_mass += pair.evidence(drifts_mps)
         mean_mps, covariance = _moments(drifts_mps, log_mass)
         if np.linalg.eigvalsh(covariance)[-1] > _GAINED * prior_m2ps2:
             return None
-        if self._shared_slopes(model, mean_mps) < _LEAST_SHARED:
+        if _shared_slopes(pairs, mean_mps) < _LEAST_SHARED:
             return None
         likely = np.linalg.inv(np.linalg.inv(covariance) - np.eye(2) / prior_m2ps2)
         farthest = int(np.argmax([known.gain_s for known in model]))
@@ -98,16 +95,94 @@ class DriftSearch:
             ),
         )
 
-    def _shared_slopes(self, model: list[MeanDrift], drift_mps: Array) -> float:
-        """Return the share of slopes that both passes have, in the direction of the least of it.
 
-        Along a ridge that goes on as far as sub-maps overlap slopes are noise, which they do not
-        share: that they overlap at all is then all that is known.
-        """
-        both, smooth = np.sum(
-            [_slopes(*each, drift_mps) for each in zip(self.jobs, model, strict=True)], axis=0
+class _Pair:
+    """A pair in coarse cells, and what a drift makes of it."""
+
+    def __init__(self, job: MatchJob, known: MeanDrift) -> None:
+        self._job, self._known = job, known
+        self._grids = coarse(job.origin_grid), coarse(job.target_grid)
+
+    def evidence(self, drifts_mps: Array) -> Array:
+        """Return the log evidence (D, D) for every drift, zero where nothing would overlap."""
+        found = np.zeros((drifts_mps.size, drifts_mps.size))
+        job, strain_m = self._job, AGE_S * _STEP_MPS * _STEPS_EACH / np.sqrt(6.0)
+        sigmas = replace(job.sigmas, strain_m=strain_m)
+        problem = pair_problem(*self._grids, job.settings, sigmas)
+        if problem is None:
+            return found
+        surfaces = dict[tuple[int, int], ErrorSurface]()
+        groups = range(drifts_mps.size // _STEPS_EACH)
+        for i, j in itertools.product(groups, groups):
+            drift_mps = drifts_mps[np.array([i, j]) * _STEPS_EACH + _STEPS_EACH // 2]
+            if np.hypot(*drift_mps) <= drifts_mps[-1]:
+                surface = self._surface(problem, drift_mps)
+                if surface is not None:
+                    surfaces[i, j] = surface
+        least = min((float(surface.misfit.min()) for surface in surfaces.values()), default=np.inf)
+        if least > _MOST_MISFIT:
+            return found
+        scale = max(_TOLERANCE * least, _LEAST_MISFIT)
+        relief = Relief(
+            background=np.inf,
+            information_per_cell=2.0 * problem.information(scale, strain_m=strain_m),
+            coherent_cells=job.settings.coherent_overlap_m2 / problem.query.grid.cell_m**2,
+            noise_scale=scale,
         )
-        return float(linalg.eigvalsh(both, smooth + _TINY * np.eye(2))[0])
+        for (i, j), surface in surfaces.items():
+            rows = slice(i * _STEPS_EACH, (i + 1) * _STEPS_EACH)
+            columns = slice(j * _STEPS_EACH, (j + 1) * _STEPS_EACH)
+            mesh_mps = np.meshgrid(drifts_mps[rows], drifts_mps[columns], indexing="ij")
+            shifts_m = -self._known.gain_s * np.stack(mesh_mps)
+            told = ambiguity.tempered_evidence(surface, relief, problem.correlated_cells)
+            told -= depth_misfit(problem, surface, _DATUM_FLOOR_M)
+            told = np.maximum(told, 0.0)
+            found[rows, columns] = _averaged(surface, told, self._known.left_m2, shifts_m)
+        return found
+
+    def slopes(self, drift_mps: Array) -> Array:
+        """Return squares of slopes by both passes and by their mean, (2, 2, 2), each per noise.
+
+        They are those where the pair lies by a drift (2,).
+        """
+        job = self._job
+        problem = pair_problem(*self._warped(drift_mps), job.settings, job.sigmas)
+        if problem is None:
+            return np.zeros((2, 2, 2))
+        shift_m = -self._known.gain_s * drift_mps
+        field = align(problem.reference, problem.query, problem.fields(), shift_m, problem.noise)
+        if field is None:
+            return np.zeros((2, 2, 2))
+        design = design_of(field, problem.noise)
+        mean = design.columns[:2]
+        both = curvature(field, design)[:2, :2]
+        return self._known.gain_s**2 * np.stack([both, (mean / field.variance_m2) @ mean.T])
+
+    def _surface(self, problem: PairProblem, drift_mps: Array) -> ErrorSurface | None:
+        """Return the error surface about the shift by a drift (2,), None if nothing overlaps."""
+        job, known = self._job, self._known
+        shift_m = -known.gain_s * drift_mps
+        half_m = known.gain_s * _STEP_MPS * _STEPS_EACH / 2 + 3.0 * np.sqrt(known.left_m2)
+        around_m = shift_m + half_m * np.array([[0, 0], [1, 1], [1, -1], [-1, 1], [-1, -1]])
+        if overlap_m2(job.origin, job.target, around_m).max() < job.settings.minimum_overlap_m2:
+            return None
+        whole = problem.surface_of(*self._warped(drift_mps))
+        if whole is None:
+            return None
+        north = np.flatnonzero(np.abs(whole.north_m - shift_m[0]) <= half_m)
+        east = np.flatnonzero(np.abs(whole.east_m - shift_m[1]) <= half_m)
+        if north.size < 2 or east.size < 2:
+            return None
+        near = whole.window(slice(north[0], north[-1] + 1), slice(east[0], east[-1] + 1))
+        return problem.strained(near) if np.isfinite(near.residual_m2).any() else None
+
+    def _warped(self, drift_mps: Array) -> tuple[GriddedSubmap, GriddedSubmap]:
+        """Return both grids, from which drifts of their own were taken, rid of a drift (2,)."""
+        job, (origin, target) = self._job, self._grids
+        north_mps, east_mps = (drift_mps - job.origin_drift_mps).tolist()
+        origin = remove_drift(origin, north_mps, east_mps, job.origin.time_s, nearest=True)
+        north_mps, east_mps = (drift_mps - job.target_drift_mps).tolist()
+        return origin, remove_drift(target, north_mps, east_mps, job.target.time_s, nearest=True)
 
 
 def _tried(reach_mps: float) -> Array:
@@ -117,97 +192,14 @@ def _tried(reach_mps: float) -> Array:
     return np.asarray(_STEP_MPS * np.arange(-each_way, each_way + 1.0))
 
 
-def _evidence(job: MatchJob, known: MeanDrift, drifts_mps: Array) -> Array:
-    """Return the log evidence (D, D) of one pair for every drift, zero where nothing overlaps."""
-    found = np.zeros((drifts_mps.size, drifts_mps.size))
-    origin, target = coarse(job.origin_grid), coarse(job.target_grid)
-    strain_m = AGE_S * _STEP_MPS * _STEPS_EACH / np.sqrt(6.0)
-    sigmas = replace(job.sigmas, strain_m=strain_m)
-    problem = pair_problem(origin, target, job.settings, sigmas)
-    if problem is None:
-        return found
-    surfaces = dict[tuple[int, int], ErrorSurface]()
-    groups = range(drifts_mps.size // _STEPS_EACH)
-    for i, j in itertools.product(groups, groups):
-        drift_mps = drifts_mps[np.array([i, j]) * _STEPS_EACH + _STEPS_EACH // 2]
-        if np.hypot(*drift_mps) > drifts_mps[-1]:
-            continue
-        surface = _surface(job, problem, (origin, target), drift_mps, known)
-        if surface is not None:
-            surfaces[i, j] = surface
-    least = min((float(surface.misfit.min()) for surface in surfaces.values()), default=np.inf)
-    if least > _MOST_MISFIT:
-        return found
-    scale = max(_TOLERANCE * least, _LEAST_MISFIT)
-    relief = Relief(
-        background=np.inf,
-        information_per_cell=2.0 * problem.information(scale, strain_m=strain_m),
-        coherent_cells=job.settings.coherent_overlap_m2 / origin.cell_m**2,
-        noise_scale=scale,
-    )
-    for (i, j), surface in surfaces.items():
-        rows = slice(i * _STEPS_EACH, (i + 1) * _STEPS_EACH)
-        columns = slice(j * _STEPS_EACH, (j + 1) * _STEPS_EACH)
-        shifts_m = -known.gain_s * np.stack(
-            np.meshgrid(drifts_mps[rows], drifts_mps[columns], indexing="ij")
-        )
-        told = ambiguity.tempered_evidence(surface, relief, problem.correlated_cells)
-        told -= depth_misfit(problem, surface, _DATUM_FLOOR_M)
-        found[rows, columns] = _averaged(surface, np.maximum(told, 0.0), known.left_m2, shifts_m)
-    return found
+def _shared_slopes(pairs: list[_Pair], drift_mps: Array) -> float:
+    """Return the share of slopes that both passes have, in the direction of the least of it.
 
-
-def _surface(
-    job: MatchJob,
-    problem: PairProblem,
-    grids: tuple[GriddedSubmap, GriddedSubmap],
-    drift_mps: Array,
-    known: MeanDrift,
-) -> ErrorSurface | None:
-    """Return the error surface of a pair rid of a drift (2,), None where it would not overlap."""
-    shift_m = -known.gain_s * drift_mps
-    half_m = known.gain_s * _STEP_MPS * _STEPS_EACH / 2 + 3.0 * np.sqrt(known.left_m2)
-    around_m = shift_m + half_m * np.array([[0, 0], [1, 1], [1, -1], [-1, 1], [-1, -1]])
-    if overlap_m2(job.origin, job.target, around_m).max() < job.settings.minimum_overlap_m2:
-        return None
-    whole = problem.surface_of(*_warped(job, grids, drift_mps))
-    if whole is None:
-        return None
-    north = np.flatnonzero(np.abs(whole.north_m - shift_m[0]) <= half_m)
-    east = np.flatnonzero(np.abs(whole.east_m - shift_m[1]) <= half_m)
-    if north.size < 2 or east.size < 2:
-        return None
-    near = whole.window(slice(north[0], north[-1] + 1), slice(east[0], east[-1] + 1))
-    return problem.strained(near) if np.isfinite(near.residual_m2).any() else None
-
-
-def _slopes(job: MatchJob, known: MeanDrift, drift_mps: Array) -> Array:
-    """Return the squares of a pair's slopes by both passes and by their mean, (2, 2, 2).
-
-    Both are told per cell's noise, for the shift that a drift (2,) implies.
+    Along a ridge that goes on as far as sub-maps overlap slopes are noise, which they do not share:
+    that they overlap at all is then all that is known.
     """
-    grids = coarse(job.origin_grid), coarse(job.target_grid)
-    problem = pair_problem(*_warped(job, grids, drift_mps), job.settings, job.sigmas)
-    if problem is None:
-        return np.zeros((2, 2, 2))
-    shift_m = -known.gain_s * drift_mps
-    field = align(problem.reference, problem.query, problem.fields(), shift_m, problem.noise)
-    if field is None:
-        return np.zeros((2, 2, 2))
-    design = design_of(field, problem.noise)
-    smooth = design.columns[:2]
-    squares = np.stack([curvature(field, design)[:2, :2], (smooth / field.variance_m2) @ smooth.T])
-    return np.asarray(known.gain_s**2 * squares)
-
-
-def _warped(
-    job: MatchJob, grids: tuple[GriddedSubmap, GriddedSubmap], drift_mps: Array
-) -> tuple[GriddedSubmap, GriddedSubmap]:
-    """Return both grids of a pair, from which its own drifts were taken, rid of a drift (2,)."""
-    north_mps, east_mps = (drift_mps - job.origin_drift_mps).tolist()
-    origin = remove_drift(grids[0], north_mps, east_mps, job.origin.time_s, nearest=True)
-    north_mps, east_mps = (drift_mps - job.target_drift_mps).tolist()
-    return origin, remove_drift(grids[1], north_mps, east_mps, job.target.time_s, nearest=True)
+    both, mean = np.sum([pair.slopes(drift_mps) for pair in pairs], axis=0)
+    return float(linalg.eigvalsh(both, mean + _TINY * np.eye(2))[0])
 
 
 def _averaged(surface: ErrorSurface, evidence: Array, left_m2: float, shifts_m: Array) -> Array:

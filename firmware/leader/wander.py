@@ -131,7 +131,9 @@ def likely_walk(changes: Sequence[DriftChange], believed: float, factor: float) 
     """Return the walk in m/s/sqrt(s) that an estimate's changes of drift speak for.
 
     What the estimate expected is taken out of what it found; what is left was measured. Successive
-    changes are taken for independent, which neighbours are not quite. The walk's prior is
+    changes are taken for independent, which neighbours are not quite: many that were measured more
+    vaguely than the believed walk makes them would argue for still water, and do not count. The
+    walk's prior is
     log-normal: the factor is its one-sigma spread, the believed walk its root mean square. The
     answer is the root mean square of the posterior, so that little evidence leaves more room for
     drift rather than less.
@@ -146,7 +148,8 @@ def likely_walk(changes: Sequence[DriftChange], believed: float, factor: float) 
         told_share = 1.0 - variances[seen] / expected
         measured = (change.change_mps @ axes)[seen] / told_share
         noise = variances[seen] / told_share
-        total = walks[:, None] ** 2 * change.interval_s + noise
-        log_likely -= 0.5 * np.sum(np.log(total) + measured**2 / total, axis=1)
+        clear = noise < believed**2 * change.interval_s
+        total = walks[:, None] ** 2 * change.interval_s + noise[clear]
+        log_likely -= 0.5 * np.sum(np.log(total) + measured[clear] ** 2 / total, axis=1)
     weights = np.exp(log_likely - log_likely.max())
     return float(np.sqrt(np.average(walks**2, weights=weights)))

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from protocol.errors import ConfigError
 from protocol.settings import Settings, setting
 
 
@@ -66,6 +67,15 @@ class ClosureSettings(Settings):
     drift_interval_s: float = setting(
         80.0, "s", "between searches: two seconds of work each, while drift is unknown", minimum=1.0
     )
-    drift_sigma_mps: float = setting(
+    drift_known_mps: float = setting(
         0.04, "m/s", "a drift known better than this is left to the closures", minimum=0.0
     )
+
+    def __post_init__(self) -> None:
+        # super() does not survive the new class that slots=True makes
+        Settings.__post_init__(self)
+        if self.drift_least_pairs > self.drift_pairs:
+            raise ConfigError(
+                f"drift_least_pairs is {self.drift_least_pairs}; a search of drift_pairs, "
+                f"{self.drift_pairs}, can have no more"
+            )

@@ -9,7 +9,6 @@ import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg, ndimage
 
 from firmware.geometry import Array
@@ -17,6 +16,7 @@ from firmware.leader import ambiguity
 from firmware.leader.alignment import align
 from firmware.leader.ambiguity import Relief
 from firmware.leader.atlas import overlap_m2
+from firmware.leader.coarse_grid import coarse
 from firmware.leader.design import curvature, design_of
 from firmware.leader.drifts import AGE_S
 from firmware.leader.hinting import depth_misfit
@@ -36,21 +36,26 @@ _LEAST_MISFIT = 1.3  # of coarse cells: by chance one shift has a tenth more tha
 _MOST_MISFIT = 3.0  # of the best shift; a pair that fits worse errs in a way that no drift explains
 _DATUM_FLOOR_M = 0.03  # of a depth offset between two passes
 _LEAST_SHARED = 0.4  # of slopes: half and more on seabed that tells, next to none along a ridge
-_TINY = 1e-9
+_TINY = 1e-9  # (s/m)^2
+_MOST_TOLD = 50.0  # nats of one pair
+_MOST_GROUPS = 12  # of drifts each way: more than a metre a second
 _GAINED = 0.25  # share of the variance, in the worse direction, up to which a drift counts as found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FoundDrift:
-    """What a search found, as a hint of the pair whose two passes lie farthest apart in time."""
+    """What a search found, as a hint of one of its pairs: passes farthest apart in time tell most.
 
-    job: MatchJob
+    `pair` is its place among the search's jobs.
+    """
+
+    pair: int
     hint: Hint
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DriftSearch:
-    """A search for the mean drift of one chain: its own pairs, at least one, and what is known.
+    """A search for the mean drift of one chain by its own pairs, at least one; first passes first.
 
     drift_sigma_mps is how large drift may be, each axis, before anything tells of it.
     """
@@ -63,7 +68,7 @@ class DriftSearch:
         """Return what all pairs together say, None where that is too little."""
         begin_s = min(job.origin.time_s for job in self.jobs)
         end_s = max(job.target.time_s for job in self.jobs)
-        model = [
+        spans = [
             mean_drift(
                 (job.origin.time_s - begin_s, job.target.time_s - begin_s),
                 end_s - begin_s,
@@ -72,8 +77,8 @@ class DriftSearch:
             )
             for job in self.jobs
         ]
-        pairs = [_Pair(job, known) for job, known in zip(self.jobs, model, strict=True)]
-        prior_m2ps2 = model[0].variance
+        pairs = [_Pair(job, span) for job, span in zip(self.jobs, spans, strict=True)]
+        prior_m2ps2 = spans[0].variance_m2ps2
         drifts_mps = _tried(_REACH_SIGMAS * np.sqrt(prior_m2ps2))
         log_mass = -0.5 * np.add.outer(drifts_mps**2, drifts_mps**2) / prior_m2ps2
         for pair in pairs:
@@ -84,14 +89,14 @@ class DriftSearch:
         if _shared_slopes(pairs, mean_mps) < _LEAST_SHARED:
             return None
         likely = np.linalg.inv(np.linalg.inv(covariance) - np.eye(2) / prior_m2ps2)
-        farthest = int(np.argmax([known.gain_s for known in model]))
-        job, known = self.jobs[farthest], model[farthest]
-        left_m2 = known.left_m2 + job.settings.hint_floor_m**2
+        farthest = int(np.argmax([span.gain_s for span in spans]))
+        span = spans[farthest]
+        left_m2 = span.left_m2 + self.jobs[farthest].settings.hint_floor_m ** 2
         return FoundDrift(
-            job=job,
+            pair=farthest,
             hint=Hint(
-                shift_m=-known.gain_s * mean_mps,
-                covariance_m2=known.gain_s**2 * likely + left_m2 * np.eye(2),
+                shift_m=-span.gain_s * mean_mps,
+                covariance_m2=span.gain_s**2 * likely + left_m2 * np.eye(2),
             ),
         )
 
@@ -99,8 +104,8 @@ class DriftSearch:
 class _Pair:
     """A pair in coarse cells, and what a drift makes of it."""
 
-    def __init__(self, job: MatchJob, known: MeanDrift) -> None:
-        self._job, self._known = job, known
+    def __init__(self, job: MatchJob, span: MeanDrift) -> None:
+        self._job, self._span = job, span
         self._grids = coarse(job.origin_grid), coarse(job.target_grid)
 
     def evidence(self, drifts_mps: Array) -> Array:
@@ -133,42 +138,43 @@ class _Pair:
             rows = slice(i * _STEPS_EACH, (i + 1) * _STEPS_EACH)
             columns = slice(j * _STEPS_EACH, (j + 1) * _STEPS_EACH)
             mesh_mps = np.meshgrid(drifts_mps[rows], drifts_mps[columns], indexing="ij")
-            shifts_m = -self._known.gain_s * np.stack(mesh_mps)
+            shifts_m = -self._span.gain_s * np.stack(mesh_mps)
             told = ambiguity.tempered_evidence(surface, relief, problem.correlated_cells)
             told -= depth_misfit(problem, surface, _DATUM_FLOOR_M)
-            told = np.maximum(told, 0.0)
-            found[rows, columns] = _averaged(surface, told, self._known.left_m2, shifts_m)
+            told = np.clip(told, 0.0, _MOST_TOLD)
+            found[rows, columns] = _averaged(surface, told, self._span.left_m2, shifts_m)
         return found
 
     def slopes(self, drift_mps: Array) -> Array:
-        """Return squares of slopes by both passes and by their mean, (2, 2, 2), each per noise.
+        """Return what slopes tell of a drift (2,) by both passes, and by their mean, (2, 2, 2).
 
-        They are those where the pair lies by a drift (2,).
+        Both are informations in (s/m)^2, where the pair lies by that drift.
         """
         job = self._job
         problem = pair_problem(*self._warped(drift_mps), job.settings, job.sigmas)
         if problem is None:
             return np.zeros((2, 2, 2))
-        shift_m = -self._known.gain_s * drift_mps
+        shift_m = -self._span.gain_s * drift_mps
         field = align(problem.reference, problem.query, problem.fields(), shift_m, problem.noise)
         if field is None:
             return np.zeros((2, 2, 2))
         design = design_of(field, problem.noise)
         mean = design.columns[:2]
         both = curvature(field, design)[:2, :2]
-        return self._known.gain_s**2 * np.stack([both, (mean / field.variance_m2) @ mean.T])
+        return self._span.gain_s**2 * np.stack([both, (mean / field.variance_m2) @ mean.T])
 
     def _surface(self, problem: PairProblem, drift_mps: Array) -> ErrorSurface | None:
         """Return the error surface about the shift by a drift (2,), None if nothing overlaps."""
-        job, known = self._job, self._known
-        shift_m = -known.gain_s * drift_mps
-        half_m = known.gain_s * _STEP_MPS * _STEPS_EACH / 2 + 3.0 * np.sqrt(known.left_m2)
+        job, span = self._job, self._span
+        shift_m = -span.gain_s * drift_mps
+        half_m = span.gain_s * _STEP_MPS * _STEPS_EACH / 2 + 3.0 * np.sqrt(span.left_m2)
         around_m = shift_m + half_m * np.array([[0, 0], [1, 1], [1, -1], [-1, 1], [-1, -1]])
         if overlap_m2(job.origin, job.target, around_m).max() < job.settings.minimum_overlap_m2:
             return None
         whole = problem.surface_of(*self._warped(drift_mps))
         if whole is None:
             return None
+        half_m += problem.query.grid.cell_m
         north = np.flatnonzero(np.abs(whole.north_m - shift_m[0]) <= half_m)
         east = np.flatnonzero(np.abs(whole.east_m - shift_m[1]) <= half_m)
         if north.size < 2 or east.size < 2:
@@ -188,7 +194,7 @@ class _Pair:
 def _tried(reach_mps: float) -> Array:
     """Return the drifts along one axis, (D,), in whole groups that share a surface."""
     groups = int(np.ceil(reach_mps / _STEP_MPS / _STEPS_EACH - 0.5))
-    each_way = groups * _STEPS_EACH + _STEPS_EACH // 2
+    each_way = min(groups, _MOST_GROUPS) * _STEPS_EACH + _STEPS_EACH // 2
     return np.asarray(_STEP_MPS * np.arange(-each_way, each_way + 1.0))
 
 
@@ -205,8 +211,8 @@ def _shared_slopes(pairs: list[_Pair], drift_mps: Array) -> float:
 def _averaged(surface: ErrorSurface, evidence: Array, left_m2: float, shifts_m: Array) -> Array:
     """Return the log of the mean of exp(evidence) about shifts (2, ...), as sure as left_m2."""
     cell_m = float(surface.north_m[1] - surface.north_m[0])
-    mass = np.exp(np.where(np.isfinite(surface.residual_m2), evidence, 0.0))
-    blurred = ndimage.gaussian_filter(mass, np.sqrt(left_m2) / cell_m, mode="constant", cval=1.0)
+    blur_cells = np.sqrt(left_m2) / cell_m
+    blurred = ndimage.gaussian_filter(np.exp(evidence), blur_cells, mode="constant", cval=1.0)
     first_m = np.array([surface.north_m[0], surface.east_m[0]]).reshape(2, 1, 1)
     at = (shifts_m - first_m) / cell_m
     means = ndimage.map_coordinates(blurred, at, order=1, mode="constant", cval=1.0)
@@ -225,33 +231,3 @@ def _moments(drifts_mps: Array, log_mass: Array) -> tuple[Array, Array]:
         [crossed, mass.sum(axis=0) @ east**2],
     ]
     return mean, np.array(second) + np.eye(2) * _STEP_MPS**2 / 12.0
-
-
-def coarse(grid: GriddedSubmap) -> GriddedSubmap:
-    """Return a grid of cells twice as large, each the mean of those known of four.
-
-    Noise of soundings is averaged; a reconstruction's is alike in neighbours.
-    """
-    rows, columns = (n // 2 * 2 for n in grid.depth_m.shape)
-    known = np.isfinite(grid.depth_m) & np.isfinite(grid.variance_m2)
-    count = _blocks(known, rows, columns).sum(axis=(1, 3))
-
-    def mean(values: Array, of: NDArray[np.bool_]) -> Array:
-        total = _blocks(np.where(of, values, 0.0), rows, columns).sum(axis=(1, 3))
-        number = _blocks(of, rows, columns).sum(axis=(1, 3))
-        return np.where(number > 0, total / np.maximum(number, 1), np.nan)
-
-    variance_m2 = mean(grid.variance_m2, known)
-    return replace(
-        grid,
-        north0_m=grid.north0_m + grid.cell_m / 2.0,
-        east0_m=grid.east0_m + grid.cell_m / 2.0,
-        cell_m=2.0 * grid.cell_m,
-        depth_m=mean(grid.depth_m, known),
-        variance_m2=variance_m2 if grid.reconstructed else variance_m2 / np.maximum(count, 1),
-        time_s=mean(grid.time_s, known & np.isfinite(grid.time_s)),
-    )
-
-
-def _blocks(values: NDArray[np.generic], rows: int, columns: int) -> NDArray[np.generic]:
-    return values[:rows, :columns].reshape(rows // 2, 2, columns // 2, 2)

@@ -38,8 +38,8 @@ class Findings:
 class SheetJobs:
     """The matches of one new sub-map, and second looks; run all, hand the findings to `finish`.
 
-    Where closures contradict each other, they come as a doubt beside the matches; where a vehicle's
-    drift is not known, a search for it does.
+    Where closures contradict each other, they come as a doubt beside the matches; where nothing
+    tells a vehicle's drift, with a search for it.
     """
 
     sheet: Sheet

@@ -145,7 +145,8 @@ class Hint:
 
     It is the factor that takes the prior to the first two moments of the posterior, widened by
     `hint_scale` and `hint_floor_m`: wide where several shifts compete, and narrower along an axis
-    that they share. Along a ridge that goes on as far as the sub-maps overlap it says nothing.
+    that they share. Along a ridge that goes on as far as the sub-maps overlap it says nothing. A
+    search of drift finds one as well.
     """
 
     shift_m: Array

@@ -33,10 +33,14 @@ Ends = tuple[tuple[int, float], ...]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OpenPair:
-    """The radius of the search at the last look, and the hint that a look left, if any."""
+    """The radius of the search at the last look, and the hint that a look left, if any.
+
+    A pair that was told together with others leaves none any more.
+    """
 
     radius_m: float
     hint: int | None = None
+    is_told: bool = False
 
 
 Turn = tuple[Sheet, list[tuple[Sheet, OpenPair]]]
@@ -153,14 +157,14 @@ class OpenPairs:
         EstimationError where a sub-map hangs on no node.
         """
         pair = job.origin.id, job.target.id
-        hint = self.hint(*pair)
+        hint, is_told = self.hint(*pair), self._is_told(*pair)
         self.note(job, outcome)
         if outcome.match is not None:
             self.settle(*pair)
             if hint is not None:
                 judgement.drop_hint(hint, graph)
                 self._heard.pop(hint, None)  # it lessens its neighbours' no more
-        elif outcome.hint is not None and hint is None:
+        elif outcome.hint is not None and hint is None and not is_told:
             ends = _ends_of(job)
             told = outcome.hint.repeated(self._heard_alike(ends, graph))
             number = enter_hint(job, told, graph, self._settings)
@@ -171,16 +175,17 @@ class OpenPairs:
             if len(self._heard) > _HEARD:
                 self._heard.popitem(last=False)
 
-    def take_back(
+    def tell(
         self, origin: SheetId, target: SheetId, graph: PoseGraph, judgement: Judgement
     ) -> None:
         """Let the hint of a pair go: it was told together with others. The pair stays open."""
-        hint = self.hint(origin, target)
-        if hint is not None:
-            judgement.drop_hint(hint, graph)
-            self._heard.pop(hint, None)
-            pairs = self._of[target]
-            pairs[origin] = replace(pairs[origin], hint=None)
+        for first, second in ((origin, target), (target, origin)):
+            pair = self._of.get(second, {}).get(first)
+            if pair is not None:
+                if pair.hint is not None:
+                    judgement.drop_hint(pair.hint, graph)
+                    self._heard.pop(pair.hint, None)
+                self._of[second][first] = replace(pair, hint=None, is_told=True)
 
     def _heard_alike(self, ends: Ends, graph: PoseGraph) -> int:
         """Return how many hints of neighbours of a pair's sub-maps are believed."""
@@ -189,6 +194,10 @@ class OpenPairs:
             for number, heard in self._heard.items()
             if _see_alike(heard, ends) or _see_alike(heard, ends[::-1])
         )
+
+    def _is_told(self, origin: SheetId, target: SheetId) -> bool:
+        pair = self._of.get(target, {}).get(origin)
+        return pair is not None and pair.is_told
 
     def __len__(self) -> int:
         return len(self._of)

@@ -4,9 +4,9 @@ A pair that did not close is remembered. Once some are, and the vehicle's drift 
 they are weighed together (`drift_search.py`), again and again while sub-maps come in.
 """
 
-import itertools
+import contextlib
 import logging
-from collections import Counter, deque
+from collections import Counter, OrderedDict
 from dataclasses import dataclass, field
 
 from firmware.leader.atlas import Atlas, Sheet, SheetId, overlap_m2
@@ -16,7 +16,7 @@ from firmware.leader.drift_search import DriftSearch, FoundDrift
 from firmware.leader.judgement import Judgement
 from firmware.leader.match_job import MatchJob
 from firmware.leader.match_jobs import jobs_of
-from firmware.leader.matches import MatchOutcome
+from firmware.leader.matches import MatchOutcome, NoMatch
 from firmware.leader.offsets import Offset, Offsets
 from firmware.leader.open_pairs import OpenPairs
 from firmware.leader.pairing import Calibrations
@@ -45,17 +45,24 @@ class _Pair:
         )
 
 
+Ends = tuple[SheetId, SheetId]
+"""Both sub-maps of a pair, the earlier one first."""
+
+
 @dataclass(slots=True, kw_only=True)
 class _Own:
-    """A chain's open pairs, when they were last weighed, and the hint that this has left."""
+    """A chain's open pairs, when they were last weighed, and the hints that this has left.
 
-    pairs: deque[_Pair] = field(default_factory=lambda: deque(maxlen=_MOST_OPEN))
+    Each hint comes with the pairs that it was told by.
+    """
+
+    pairs: OrderedDict[Ends, _Pair] = field(default_factory=OrderedDict)
     searched_s: float = -float("inf")
-    hint: int | None = None
+    hints: dict[int, set[Ends]] = field(default_factory=dict)
 
 
 class OwnPairs:
-    """Open pairs of every chain with itself."""
+    """Open pairs of every chain with itself; drift_sigma_mps is that of `DriftSearch`."""
 
     def __init__(self, settings: ClosureSettings, drift_sigma_mps: float) -> None:
         self.counters: Counter[str] = Counter()
@@ -63,23 +70,23 @@ class OwnPairs:
         self._of: dict[int, _Own] = {}
 
     def note(self, job: MatchJob, outcome: MatchOutcome) -> None:
-        """Remember a pair of one chain that gave no closure."""
+        """Remember a pair of one chain that gave no closure, and forget one that did."""
         origin, target = job.origin, job.target
-        if origin.id.chain != target.id.chain or outcome.match is not None:
+        if origin.id.chain != target.id.chain or outcome.reason is NoMatch.RAISED:
             return
-        first, second = sorted((origin, target), key=lambda sheet: sheet.time_s)
-        own = self._of.setdefault(target.id.chain, _Own())
-        known = {(pair.origin, pair.target) for pair in own.pairs}
-        if (first.id, second.id) not in known:
-            area_m2 = float(overlap_m2(origin, target, job.prior_shift_m[None])[0])
-            own.pairs.append(
-                _Pair(
-                    origin=first.id,
-                    target=second.id,
-                    times_s=(first.time_s, second.time_s),
-                    area_m2=area_m2,
-                )
-            )
+        own, ends = self._of.setdefault(target.id.chain, _Own()), _ends_of(job)
+        if outcome.match is not None:
+            own.pairs.pop(ends, None)
+            return
+        own.pairs[ends] = _Pair(
+            origin=ends[0],
+            target=ends[1],
+            times_s=(min(origin.time_s, target.time_s), max(origin.time_s, target.time_s)),
+            area_m2=float(overlap_m2(origin, target, job.prior_shift_m[None])[0]),
+        )
+        if len(own.pairs) > _MOST_OPEN:
+            own.pairs.popitem(last=False)
+            self.counters["own_pairs_dropped"] += 1
 
     def search(
         self,
@@ -106,6 +113,7 @@ class OwnPairs:
                 return None
             jobs = jobs_of(known, graph, s, calibrations)
         except EstimationError:
+            self.counters["drift_searches_unplaceable"] += 1
             return None
         except Exception:
             LOG.exception("the drift of %s cannot be searched", sheet.id)
@@ -124,44 +132,66 @@ class OwnPairs:
         judgement: Judgement,
         open_pairs: OpenPairs,
     ) -> None:
-        """Tell the graph what a search found, in place of what it and its pairs told before."""
+        """Tell the graph what a search found, in place of what its pairs have told before.
+
+        Where one of them has closed meanwhile, the closure tells.
+        """
         if found is None:
             return
-        own = self._of[found.job.target.id.chain]
-        try:
-            number = enter_hint(found.job, found.hint, graph, self._settings)
-        except EstimationError:
+        job, told = search.jobs[found.pair], set(map(_ends_of, search.jobs))
+        own = self._of.get(job.target.id.chain)
+        if own is None or not told <= own.pairs.keys():
+            self.counters["drifts_superseded"] += 1
             return
+        number = None
+        with contextlib.suppress(EstimationError):
+            number = enter_hint(job, found.hint, graph, self._settings)
         if number is None:
+            self.counters["drifts_refused"] += 1
             return
-        if own.hint is not None and own.hint in graph:
-            judgement.drop_hint(own.hint, graph)
-        own.hint = number
+        for before in [before for before, pairs in own.hints.items() if pairs & told]:
+            judgement.drop_hint(before, graph)
+            del own.hints[before]
+        own.hints[number] = told
         judgement.note_hint(number)
-        for job in search.jobs:
-            open_pairs.take_back(job.origin.id, job.target.id, graph, judgement)
+        for ends in told:
+            open_pairs.tell(*ends, graph, judgement)
         self.counters["drifts_found"] += 1
 
     def forget(self, before_s: float) -> None:
-        """Forget chains of which nothing was heard since."""
+        """Forget pairs and hints of a past that was composed."""
         for chain, own in list(self._of.items()):
-            if not own.pairs or own.pairs[-1].times_s[1] < before_s:
+            for ends, pair in list(own.pairs.items()):
+                if pair.times_s[1] < before_s:
+                    del own.pairs[ends]
+            if not own.pairs:
                 del self._of[chain]
 
     def _chosen(self, own: _Own, now_s: float, atlas: Atlas) -> list[_Pair]:
-        """Return pairs that overlap most, no two of them of the same soundings."""
-        chosen, s = list[_Pair](), self._settings
-        for pair in sorted(own.pairs, key=lambda pair: -pair.area_m2):
-            is_held = pair.origin in atlas and pair.target in atlas
-            if is_held and pair.times_s[1] > now_s - s.drift_memory_s:
-                if not any(map(pair.is_near, chosen)):
-                    chosen.append(pair)
-        return list(itertools.islice(chosen, s.drift_pairs))
+        """Return the pairs that overlap most, no two of them of the same soundings."""
+        s = self._settings
+        held = (
+            pair
+            for pair in own.pairs.values()
+            if pair.origin in atlas
+            and pair.target in atlas
+            and pair.times_s[0] > now_s - s.drift_memory_s
+        )
+        chosen = list[_Pair]()
+        for pair in sorted(held, key=lambda pair: -pair.area_m2):
+            if not any(map(pair.is_near, chosen)):
+                chosen.append(pair)
+        return chosen[: s.drift_pairs]
 
     def _is_known(self, offsets: list[Offset]) -> bool:
         """Return whether the offset of the passes farthest apart in time tells the drift."""
-        farthest = max(offsets, key=_lag_s)
-        return farthest.sigma_m <= self._settings.drift_sigma_mps * _lag_s(farthest)
+        farthest, s = max(offsets, key=_lag_s), self._settings
+        return farthest.sigma_m <= max(s.hint_prior_m, s.drift_known_mps * _lag_s(farthest))
+
+
+def _ends_of(job: MatchJob) -> Ends:
+    first, second = sorted((job.origin, job.target), key=lambda sheet: sheet.time_s)
+    return first.id, second.id
 
 
 def _lag_s(offset: Offset) -> float:

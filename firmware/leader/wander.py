@@ -14,6 +14,7 @@ from firmware.geometry import Array
 
 _REACH = 256.0  # how far from the first belief a walk is looked for, up and down, as a factor
 _GRID = 81
+_LARGE = 3.0  # sigmas of a change that counts however vague it is
 _TOLD = 0.99  # of the expected variance: what leaves more was told nothing
 
 
@@ -58,11 +59,11 @@ def reckoned_m2(
 class MeanDrift:
     """What the mean drift over a time says of dead reckoning within it, each axis.
 
-    variance in (m/s)^2 is that of the mean drift; a drift leads dead reckoning astray by gain_s
+    variance_m2ps2 is that of the mean drift; a drift leads dead reckoning astray by gain_s
     times itself within the span, give or take left_m2.
     """
 
-    variance: float
+    variance_m2ps2: float
     gain_s: float
     left_m2: float
 
@@ -83,7 +84,7 @@ def mean_drift(
     span_m2 = drift * length_s**2 + walk * length_s**2 * (begin_s + length_s / 3)
     span_m2 += noise_m2ps * length_s
     return MeanDrift(
-        variance=whole_m2 / duration_s**2,
+        variance_m2ps2=whole_m2 / duration_s**2,
         gain_s=both_m2 * duration_s / whole_m2,
         left_m2=max(span_m2 - both_m2**2 / whole_m2, 0.0),
     )
@@ -132,11 +133,10 @@ def likely_walk(changes: Sequence[DriftChange], believed: float, factor: float) 
 
     What the estimate expected is taken out of what it found; what is left was measured. Successive
     changes are taken for independent, which neighbours are not quite: many that were measured more
-    vaguely than the believed walk makes them would argue for still water, and do not count. The
-    walk's prior is
-    log-normal: the factor is its one-sigma spread, the believed walk its root mean square. The
-    answer is the root mean square of the posterior, so that little evidence leaves more room for
-    drift rather than less.
+    vaguely than the believed walk makes them would argue for still water, and do not count unless
+    they are large. The walk's prior is log-normal: the factor is its one-sigma spread, the believed
+    walk its root mean square. The answer is the root mean square of the posterior, so that little
+    evidence leaves more room for drift rather than less.
     """
     walks = believed * np.geomspace(1 / _REACH, _REACH, _GRID)
     spread = np.log(factor)
@@ -148,7 +148,7 @@ def likely_walk(changes: Sequence[DriftChange], believed: float, factor: float) 
         told_share = 1.0 - variances[seen] / expected
         measured = (change.change_mps @ axes)[seen] / told_share
         noise = variances[seen] / told_share
-        clear = noise < believed**2 * change.interval_s
+        clear = (noise < believed**2 * change.interval_s) | (measured**2 > _LARGE**2 * noise)
         total = walks[:, None] ** 2 * change.interval_s + noise[clear]
         log_likely -= 0.5 * np.sum(np.log(total) + measured[clear] ** 2 / total, axis=1)
     weights = np.exp(log_likely - log_likely.max())

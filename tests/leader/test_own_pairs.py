@@ -22,7 +22,7 @@ from firmware.leader.pose_graph import PoseGraph
 from tests.leader.sheets import northward, sheet_at
 
 NOTHING = MatchOutcome(match=None, reason=NoMatch.UNSETTLED)
-SETTINGS = ClosureSettings(drift_least_pairs=2, drift_sigma_mps=1e-3)
+SETTINGS = ClosureSettings(drift_least_pairs=2, drift_known_mps=0.0, hint_prior_m=0.1)
 LOOK = Look(
     vehicle=0,
     starboard=np.array([0.0, 1.0]),
@@ -110,7 +110,7 @@ def test_pairs_without_a_closure_are_searched_again_after_a_while(
 def test_known_drift_is_left_to_closures(
     atlas: Atlas, graph: PoseGraph, calibrations: Calibrations
 ) -> None:
-    own = OwnPairs(dataclasses.replace(SETTINGS, drift_sigma_mps=1.0), 0.2)
+    own = OwnPairs(dataclasses.replace(SETTINGS, drift_known_mps=1.0), 0.2)
     for first, second in ((1, 3), (0, 4)):
         own.note(_job(_sheet(first), _sheet(second)), NOTHING)
     assert _searched(own, 4, atlas, graph, calibrations) is None
@@ -159,7 +159,7 @@ def test_what_is_found_takes_the_place_of_earlier_hints(
     assert _active(graph) == before | {len(before)}
     search = DriftSearch(jobs=(job,), wandering=graph.wandering, drift_sigma_mps=0.2)
     for taken in range(1, 3):
-        own.take(search, FoundDrift(job=job, hint=hint), graph, judgement, open_pairs)
+        own.take(search, FoundDrift(pair=0, hint=hint), graph, judgement, open_pairs)
         assert _active(graph) == before | {len(before) + taken}
         assert open_pairs.hint(job.origin.id, job.target.id) is None
     own.take(search, None, graph, judgement, open_pairs)

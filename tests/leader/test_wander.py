@@ -123,6 +123,8 @@ def test_little_evidence_moves_it_little() -> None:
 def test_vague_changes_do_not_argue_for_still_water() -> None:
     vague = _changes(np.random.default_rng(7), 0.0, BELIEVED, 0.1, 50)
     assert likely_walk(vague, BELIEVED, FACTOR) == pytest.approx(BELIEVED, rel=0.02)
+    wild = _changes(np.random.default_rng(7), 10.0 * BELIEVED, BELIEVED, 0.1, 50)
+    assert likely_walk(wild, BELIEVED, FACTOR) > 5.0 * BELIEVED
 
 
 def test_changes_are_between_successive_epochs() -> None:

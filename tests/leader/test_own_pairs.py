@@ -19,6 +19,8 @@ from firmware.leader.open_pairs import OpenPairs
 from firmware.leader.own_pairs import OwnPairs
 from firmware.leader.pairing import Calibrations
 from firmware.leader.pose_graph import PoseGraph
+from firmware.leader.wander import Wandering
+from protocol.errors import ConfigError
 from tests.leader.sheets import northward, sheet_at
 
 NOTHING = MatchOutcome(match=None, reason=NoMatch.UNSETTLED)
@@ -135,6 +137,31 @@ def test_pairs_of_the_same_soundings_are_weighed_once(
     assert _spans(_searched(own, 4, atlas, graph, calibrations)) == {(1, 3), (0, 4)}
 
 
+def test_pairs_that_closed_since_are_weighed_no_more(
+    own: OwnPairs, atlas: Atlas, graph: PoseGraph, calibrations: Calibrations
+) -> None:
+    closed = MatchOutcome(match=MagicMock(Match), reason=None)
+    raised = MatchOutcome(match=None, reason=NoMatch.RAISED)
+    own.note(_job(_sheet(2), _sheet(5)), NOTHING)
+    own.note(_job(_sheet(0), _sheet(4)), closed)
+    own.note(_job(_sheet(0), _sheet(5)), raised)
+    assert _spans(_searched(own, 5, atlas, graph, calibrations)) == {(1, 3), (2, 5)}
+
+
+def test_passes_of_long_ago_are_weighed_no_more(
+    atlas: Atlas, graph: PoseGraph, calibrations: Calibrations
+) -> None:
+    own = OwnPairs(dataclasses.replace(SETTINGS, drift_memory_s=130.0), 0.2)
+    for first, second in ((1, 3), (0, 4), (2, 4)):
+        own.note(_job(_sheet(first), _sheet(second)), NOTHING)
+    assert _spans(_searched(own, 4, atlas, graph, calibrations)) == {(1, 3), (2, 4)}
+
+
+def test_search_of_fewer_pairs_than_it_needs_is_refused() -> None:
+    with pytest.raises(ConfigError, match="drift_least_pairs is 9"):
+        ClosureSettings(drift_least_pairs=9)
+
+
 def test_what_is_forgotten_is_weighed_no_more(
     own: OwnPairs, atlas: Atlas, graph: PoseGraph, calibrations: Calibrations
 ) -> None:
@@ -148,23 +175,54 @@ def _active(graph: PoseGraph) -> set[int]:
     return {number for number in range(graph.records) if graph.is_active(number)}
 
 
+HINT = Hint(shift_m=np.array([3.0, -2.0]), covariance_m2=25.0 * np.eye(2))
+
+
+def _search_of(*jobs: MatchJob) -> DriftSearch:
+    wandering = Wandering(noise=0.2, walk=0.004, apart=0.001)
+    return DriftSearch(jobs=jobs, wandering=wandering, drift_sigma_mps=0.2)
+
+
+@pytest.mark.parametrize("is_turned", [False, True])
 def test_what_is_found_takes_the_place_of_earlier_hints(
-    own: OwnPairs, graph: PoseGraph, calibrations: Calibrations
+    own: OwnPairs, graph: PoseGraph, calibrations: Calibrations, *, is_turned: bool
 ) -> None:
     judgement, open_pairs = Judgement(JudgementSettings(), calibrations), OpenPairs(SETTINGS)
     before, job = _active(graph), _job(_sheet(0), _sheet(4))
-    hint = Hint(shift_m=np.array([3.0, -2.0]), covariance_m2=25.0 * np.eye(2))
-    ambiguous = MatchOutcome(match=None, reason=NoMatch.AMBIGUOUS, hint=hint)
-    open_pairs.keep_or_settle(job, ambiguous, graph, judgement)
+    looked = _job(_sheet(4), _sheet(0)) if is_turned else job
+    ambiguous = MatchOutcome(match=None, reason=NoMatch.AMBIGUOUS, hint=HINT)
+    open_pairs.keep_or_settle(looked, ambiguous, graph, judgement)
     assert _active(graph) == before | {len(before)}
-    search = DriftSearch(jobs=(job,), wandering=graph.wandering, drift_sigma_mps=0.2)
     for taken in range(1, 3):
-        own.take(search, FoundDrift(pair=0, hint=hint), graph, judgement, open_pairs)
+        own.take(_search_of(job), FoundDrift(pair=0, hint=HINT), graph, judgement, open_pairs)
         assert _active(graph) == before | {len(before) + taken}
-        assert open_pairs.hint(job.origin.id, job.target.id) is None
-    own.take(search, None, graph, judgement, open_pairs)
+    open_pairs.keep_or_settle(looked, ambiguous, graph, judgement)  # told together with others
+    own.take(_search_of(job), None, graph, judgement, open_pairs)
     assert _active(graph) == before | {len(before) + 2}
     assert own.counters["drifts_found"] == 2
+
+
+def test_what_other_pairs_found_stays(
+    own: OwnPairs, graph: PoseGraph, calibrations: Calibrations
+) -> None:
+    judgement, open_pairs = Judgement(JudgementSettings(), calibrations), OpenPairs(SETTINGS)
+    before = len(_active(graph))
+    for first, second in ((0, 4), (1, 3)):
+        search = _search_of(_job(_sheet(first), _sheet(second)))
+        own.take(search, FoundDrift(pair=0, hint=HINT), graph, judgement, open_pairs)
+    assert len(_active(graph)) == before + 2
+
+
+def test_what_a_closure_tells_is_not_told_again(
+    own: OwnPairs, graph: PoseGraph, calibrations: Calibrations
+) -> None:
+    judgement, open_pairs = Judgement(JudgementSettings(), calibrations), OpenPairs(SETTINGS)
+    before, closing = _active(graph), _job(_sheet(1), _sheet(3))
+    search = _search_of(_job(_sheet(0), _sheet(4)), closing)
+    own.note(closing, MatchOutcome(match=MagicMock(Match), reason=None))
+    own.take(search, FoundDrift(pair=0, hint=HINT), graph, judgement, open_pairs)
+    assert _active(graph) == before
+    assert own.counters["drifts_superseded"] == 1
 
 
 def test_search_that_cannot_be_made_is_counted(

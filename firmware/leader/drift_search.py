@@ -28,6 +28,7 @@ from firmware.leader.wander import MeanDrift, Wandering, mean_drift
 from firmware.leader.warping import remove_drift
 from firmware.submaps import GriddedSubmap
 
+_SUBMAP_S = 40.0  # in which both passes walk, beside their drift
 _STEP_MPS = 0.02  # between drifts that are tried
 _STEPS_EACH = 5  # along each axis, that share a surface: their strain differs by half a metre
 _REACH_SIGMAS = 2.25  # of the drift before anything is known, that are tried
@@ -111,7 +112,10 @@ class _Pair:
     def evidence(self, drifts_mps: Array) -> Array:
         """Return the log evidence (D, D) for every drift, zero where nothing would overlap."""
         found = np.zeros((drifts_mps.size, drifts_mps.size))
-        job, strain_m = self._job, AGE_S * _STEP_MPS * _STEPS_EACH / np.sqrt(6.0)
+        job = self._job
+        rounded_m = AGE_S * _STEP_MPS * _STEPS_EACH / np.sqrt(6.0)
+        walked_m = np.sqrt(job.settings.walk_m2_per_s * _SUBMAP_S / 3.0)
+        strain_m = float(np.hypot(rounded_m, walked_m))
         sigmas = replace(job.sigmas, strain_m=strain_m)
         problem = pair_problem(*self._grids, job.settings, sigmas)
         if problem is None:

@@ -149,9 +149,11 @@ class OwnPairs:
         if number is None:
             self.counters["drifts_refused"] += 1
             return
-        for before in [before for before, pairs in own.hints.items() if pairs & told]:
-            judgement.drop_hint(before, graph)
-            del own.hints[before]
+        for before, pairs in list(own.hints.items()):
+            if pairs & told:
+                judgement.drop_hint(before, graph)
+            if pairs & told or before not in graph:  # then it was composed
+                del own.hints[before]
         own.hints[number] = told
         judgement.note_hint(number)
         for ends in told:

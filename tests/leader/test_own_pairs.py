@@ -213,6 +213,17 @@ def test_what_other_pairs_found_stays(
     assert len(_active(graph)) == before + 2
 
 
+def test_what_was_composed_is_not_remembered(
+    own: OwnPairs, graph: PoseGraph, calibrations: Calibrations
+) -> None:
+    judgement, open_pairs = Judgement(JudgementSettings(), calibrations), OpenPairs(SETTINGS)
+    for first, second in ((0, 4), (1, 3)):
+        search = _search_of(_job(_sheet(first), _sheet(second)))
+        own.take(search, FoundDrift(pair=0, hint=HINT), graph, judgement, open_pairs)
+        (number,) = own._of[0].hints
+        graph._ledger.pop(number)
+
+
 def test_what_a_closure_tells_is_not_told_again(
     own: OwnPairs, graph: PoseGraph, calibrations: Calibrations
 ) -> None:

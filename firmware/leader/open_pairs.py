@@ -71,7 +71,7 @@ class OpenPairs:
 
     def hint(self, origin: SheetId, target: SheetId) -> int | None:
         """Return the hint that a look at the pair has left, if any."""
-        pair = self._of.get(target, {}).get(origin)
+        pair = self._pair(origin, target)
         return None if pair is None else pair.hint
 
     def note_hint(self, origin: SheetId, target: SheetId, number: int | None) -> None:
@@ -157,7 +157,8 @@ class OpenPairs:
         EstimationError where a sub-map hangs on no node.
         """
         pair = job.origin.id, job.target.id
-        hint, is_told = self.hint(*pair), self._is_told(*pair)
+        known = self._pair(*pair)
+        hint, is_told = (None, False) if known is None else (known.hint, known.is_told)
         self.note(job, outcome)
         if outcome.match is not None:
             self.settle(*pair)
@@ -180,7 +181,7 @@ class OpenPairs:
     ) -> None:
         """Let the hint of a pair go: it was told together with others. The pair stays open."""
         for first, second in ((origin, target), (target, origin)):
-            pair = self._of.get(second, {}).get(first)
+            pair = self._pair(first, second)
             if pair is not None:
                 if pair.hint is not None:
                     judgement.drop_hint(pair.hint, graph)
@@ -195,9 +196,8 @@ class OpenPairs:
             if _see_alike(heard, ends) or _see_alike(heard, ends[::-1])
         )
 
-    def _is_told(self, origin: SheetId, target: SheetId) -> bool:
-        pair = self._of.get(target, {}).get(origin)
-        return pair is not None and pair.is_told
+    def _pair(self, origin: SheetId, target: SheetId) -> OpenPair | None:
+        return self._of.get(target, {}).get(origin)
 
     def __len__(self) -> int:
         return len(self._of)

@@ -30,10 +30,8 @@ _APART_S = 30.0  # pairs of which both sub-maps are nearer in time share their s
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Pair:
-    """A pair of sub-maps, when they were measured, and how much they were expected to overlap."""
+    """When two sub-maps were measured, and how much they were expected to overlap."""
 
-    origin: SheetId
-    target: SheetId
     times_s: tuple[float, float]
     area_m2: float
 
@@ -79,8 +77,6 @@ class OwnPairs:
             own.pairs.pop(ends, None)
             return
         own.pairs[ends] = _Pair(
-            origin=ends[0],
-            target=ends[1],
             times_s=(min(origin.time_s, target.time_s), max(origin.time_s, target.time_s)),
             area_m2=float(overlap_m2(origin, target, job.prior_shift_m[None])[0]),
         )
@@ -108,7 +104,7 @@ class OwnPairs:
             return None
         own.searched_s = sheet.time_s
         try:
-            known = offsets.of([(atlas[pair.origin], atlas[pair.target]) for pair in pairs])
+            known = offsets.of([(atlas[first], atlas[second]) for first, second in pairs])
             if len(known) < s.drift_least_pairs or self._is_known(known):
                 return None
             jobs = jobs_of(known, graph, s, calibrations)
@@ -169,21 +165,17 @@ class OwnPairs:
             if not own.pairs:
                 del self._of[chain]
 
-    def _chosen(self, own: _Own, now_s: float, atlas: Atlas) -> list[_Pair]:
+    def _chosen(self, own: _Own, now_s: float, atlas: Atlas) -> list[Ends]:
         """Return the pairs that overlap most, no two of them of the same soundings."""
-        s = self._settings
-        held = (
-            pair
-            for pair in own.pairs.values()
-            if pair.origin in atlas
-            and pair.target in atlas
-            and pair.times_s[0] > now_s - s.drift_memory_s
-        )
-        chosen = list[_Pair]()
-        for pair in sorted(held, key=lambda pair: -pair.area_m2):
-            if not any(map(pair.is_near, chosen)):
-                chosen.append(pair)
-        return chosen[: s.drift_pairs]
+        since_s = now_s - self._settings.drift_memory_s
+        by_area = sorted(own.pairs.items(), key=lambda item: -item[1].area_m2)
+        chosen = dict[Ends, _Pair]()
+        for ends, pair in by_area:
+            if pair.times_s[0] <= since_s or not all(sheet_id in atlas for sheet_id in ends):
+                continue
+            if not any(map(pair.is_near, chosen.values())):
+                chosen[ends] = pair
+        return list(chosen)[: self._settings.drift_pairs]
 
     def _is_known(self, offsets: list[Offset]) -> bool:
         """Return whether the offset of the passes farthest apart in time tells the drift."""

@@ -155,12 +155,17 @@ def misfit_of(surface: ErrorSurface, noise_scale: float, correlated_cells: float
 def moments(found: Posterior, prior: Prior) -> tuple[Array, Array]:
     """Return mean (2,) and covariance (2, 2) of the shift; what lies outside is as the prior."""
     north, east = found.north_m - prior.mean_m[0], found.east_m - prior.mean_m[1]
-    by_north, by_east = found.mass.sum(axis=1), found.mass.sum(axis=0)
-    mean = np.array([by_north @ north, by_east @ east])
-    crossed = float(north @ found.mass @ east)
-    second = np.array([[by_north @ north**2, crossed], [crossed, by_east @ east**2]])
+    mean, second = moments_of(found.mass, north, east)
     second += found.outside * prior.covariance_m2
     return prior.mean_m + mean, second - np.outer(mean, mean)
+
+
+def moments_of(mass: Array, north: Array, east: Array) -> tuple[Array, Array]:
+    """Return the first (2,) and second (2, 2) moments about zero of mass (K, L) at (K,), (L,)."""
+    by_north, by_east = mass.sum(axis=1), mass.sum(axis=0)
+    mean = np.array([by_north @ north, by_east @ east])
+    crossed = float(north @ mass @ east)
+    return mean, np.array([[by_north @ north**2, crossed], [crossed, by_east @ east**2]])
 
 
 def posterior(surface: ErrorSurface, evidence: Array, prior: Prior, null_share: float) -> Posterior:

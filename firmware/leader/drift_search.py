@@ -18,7 +18,7 @@ from firmware.leader.ambiguity import Relief
 from firmware.leader.atlas import overlap_m2
 from firmware.leader.coarse_grid import coarse
 from firmware.leader.design import curvature, design_of
-from firmware.leader.drifts import AGE_S
+from firmware.leader.drifts import AGE_S, SUBMAP_S
 from firmware.leader.hinting import depth_misfit
 from firmware.leader.match_job import MatchJob
 from firmware.leader.matches import Hint
@@ -28,7 +28,6 @@ from firmware.leader.wander import MeanDrift, Wandering, mean_drift
 from firmware.leader.warping import remove_drift
 from firmware.submaps import GriddedSubmap
 
-_SUBMAP_S = 40.0  # in which both passes walk, beside their drift
 _STEP_MPS = 0.02  # between drifts that are tried
 _STEPS_EACH = 5  # along each axis, that share a surface: their strain differs by half a metre
 _REACH_SIGMAS = 2.25  # of the drift before anything is known, that are tried
@@ -78,7 +77,7 @@ class DriftSearch:
             )
             for job in self.jobs
         ]
-        pairs = [_Pair(job, span) for job, span in zip(self.jobs, spans, strict=True)]
+        pairs = [_Tried(job, span) for job, span in zip(self.jobs, spans, strict=True)]
         prior_m2ps2 = spans[0].variance_m2ps2
         drifts_mps = _tried(_REACH_SIGMAS * np.sqrt(prior_m2ps2))
         log_mass = -0.5 * np.add.outer(drifts_mps**2, drifts_mps**2) / prior_m2ps2
@@ -102,7 +101,7 @@ class DriftSearch:
         )
 
 
-class _Pair:
+class _Tried:
     """A pair in coarse cells, and what a drift makes of it."""
 
     def __init__(self, job: MatchJob, span: MeanDrift) -> None:
@@ -114,7 +113,7 @@ class _Pair:
         found = np.zeros((drifts_mps.size, drifts_mps.size))
         job = self._job
         rounded_m = AGE_S * _STEP_MPS * _STEPS_EACH / np.sqrt(6.0)
-        walked_m = np.sqrt(job.settings.walk_m2_per_s * _SUBMAP_S / 3.0)
+        walked_m = np.sqrt(job.settings.walk_m2_per_s * SUBMAP_S / 3.0)
         strain_m = float(np.hypot(rounded_m, walked_m))
         sigmas = replace(job.sigmas, strain_m=strain_m)
         problem = pair_problem(*self._grids, job.settings, sigmas)
@@ -178,13 +177,10 @@ class _Pair:
         whole = problem.surface_of(*self._warped(drift_mps))
         if whole is None:
             return None
-        half_m += problem.query.grid.cell_m
-        north = np.flatnonzero(np.abs(whole.north_m - shift_m[0]) <= half_m)
-        east = np.flatnonzero(np.abs(whole.east_m - shift_m[1]) <= half_m)
-        if north.size < 2 or east.size < 2:
+        near = whole.around(shift_m, np.full(2, half_m + problem.query.grid.cell_m))
+        if near is None or not np.isfinite(near.residual_m2).any():
             return None
-        near = whole.window(slice(north[0], north[-1] + 1), slice(east[0], east[-1] + 1))
-        return problem.strained(near) if np.isfinite(near.residual_m2).any() else None
+        return problem.strained(near)
 
     def _warped(self, drift_mps: Array) -> tuple[GriddedSubmap, GriddedSubmap]:
         """Return both grids, from which drifts of their own were taken, rid of a drift (2,)."""
@@ -202,7 +198,7 @@ def _tried(reach_mps: float) -> Array:
     return np.asarray(_STEP_MPS * np.arange(-each_way, each_way + 1.0))
 
 
-def _shared_slopes(pairs: list[_Pair], drift_mps: Array) -> float:
+def _shared_slopes(pairs: list[_Tried], drift_mps: Array) -> float:
     """Return the share of slopes that both passes have, in the direction of the least of it.
 
     Along a ridge that goes on as far as sub-maps overlap slopes are noise, which they do not share:
@@ -226,12 +222,5 @@ def _averaged(surface: ErrorSurface, evidence: Array, left_m2: float, shifts_m: 
 def _moments(drifts_mps: Array, log_mass: Array) -> tuple[Array, Array]:
     """Return mean (2,) and covariance (2, 2) of a drift of so much mass (D, D)."""
     mass = np.exp(log_mass - log_mass.max())
-    mass /= mass.sum()
-    mean = np.array([mass.sum(axis=1) @ drifts_mps, mass.sum(axis=0) @ drifts_mps])
-    north, east = drifts_mps - mean[0], drifts_mps - mean[1]
-    crossed = float(north @ mass @ east)
-    second = [
-        [mass.sum(axis=1) @ north**2, crossed],
-        [crossed, mass.sum(axis=0) @ east**2],
-    ]
-    return mean, np.array(second) + np.eye(2) * _STEP_MPS**2 / 12.0
+    mean, second = ambiguity.moments_of(mass / mass.sum(), drifts_mps, drifts_mps)
+    return mean, second - np.outer(mean, mean) + np.eye(2) * _STEP_MPS**2 / 12.0

@@ -20,7 +20,8 @@ from firmware.leader.screening import ErrorSurface
 from firmware.leader.warping import remove_drift
 from firmware.submaps import GriddedSubmap
 
-AGE_S = 40.0 / np.sqrt(12.0)  # of the cells of a sub-map, root mean square
+SUBMAP_S = 40.0  # in which a sub-map is measured
+AGE_S = SUBMAP_S / np.sqrt(12.0)  # of the cells of a sub-map, root mean square
 _REACH_SIGMAS = 2.5  # of the prior, beyond which the outermost drift has to do
 _APART_M = 3.0  # cells of two sub-maps, between one drift and the next
 _MOST_EACH_WAY = 3  # of drifts along an axis, beside the expected one

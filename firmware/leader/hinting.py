@@ -36,14 +36,14 @@ def hint_of(
     settings, surface = problem.settings, problem.strained(surface)
     cautious = _cautious(problem, surface, relief, prior)
     evidence = ambiguity.tempered_evidence(surface, cautious, problem.correlated_cells)
-    against_m = depth_misfit(problem, surface, _DATUM_FLOOR_M)
-    evidence -= against_m
+    depth_nats = depth_misfit(problem, surface, _DATUM_FLOOR_M)
+    evidence -= depth_nats
     found = ambiguity.posterior(surface, evidence, prior, settings.null_share)
     mean_m, covariance_m2 = ambiguity.moments(found, prior)
     root = np.linalg.cholesky(prior.covariance_m2)
     inverse = np.linalg.inv(root)
     left, axes = np.linalg.eigh(inverse @ covariance_m2 @ inverse.T)  # shares of the prior
-    contradicted = _contradicted(problem, surface, cautious, against_m)
+    contradicted = _contradicted(problem, surface, cautious, depth_nats)
     sigmas = np.sqrt(np.maximum(left, _LEAST_SHARE))
     away = axes.T @ inverse @ _shifts_from(surface, mean_m) / sigmas[:, None]
     closed = np.array([_is_closed(away[k], away[1 - k], contradicted) for k in (0, 1)])

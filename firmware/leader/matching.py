@@ -137,11 +137,7 @@ def _window(whole: ErrorSurface, prior: Prior, problem: PairProblem) -> ErrorSur
     settings = problem.settings
     half = settings.search_sigmas * np.sqrt(np.diag(prior.covariance_m2))
     half = np.minimum(half + 2.0 * problem.query.grid.cell_m, settings.search_cap_m)
-    north = np.flatnonzero(np.abs(whole.north_m - prior.mean_m[0]) <= half[0])
-    east = np.flatnonzero(np.abs(whole.east_m - prior.mean_m[1]) <= half[1])
-    if north.size < 2 or east.size < 2:
-        return None
-    return whole.window(slice(north[0], north[-1] + 1), slice(east[0], east[-1] + 1))
+    return whole.around(prior.mean_m, half)
 
 
 def _best(surface: ErrorSurface) -> Array:

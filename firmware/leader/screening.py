@@ -71,6 +71,17 @@ class ErrorSurface:
             depth_offset_m=self.depth_offset_m[north, east],
         )
 
+    def around(self, centre_m: Array, half_m: Array) -> "ErrorSurface | None":
+        """Return the shifts no farther than half_m (2,) from a centre (2,), None if they are few.
+
+        Two along each axis are the least of which a surface is made.
+        """
+        north = np.flatnonzero(np.abs(self.north_m - centre_m[0]) <= half_m[0])
+        east = np.flatnonzero(np.abs(self.east_m - centre_m[1]) <= half_m[1])
+        if north.size < 2 or east.size < 2:
+            return None
+        return self.window(slice(north[0], north[-1] + 1), slice(east[0], east[-1] + 1))
+
     def squares_from(self, mean_m: Array, covariance_m2: Array) -> Array:
         """Return squared distances (K, L) of the shifts from a mean, in units of a covariance."""
         north, east = self.north_m - mean_m[0], self.east_m - mean_m[1]

@@ -5,9 +5,21 @@ import dataclasses
 import numpy as np
 
 from firmware.leader.atlas import Sheet, SheetId, sheet_of
+from firmware.leader.displacement import Look
 from firmware.leader.graph_settings import GraphSettings
+from firmware.leader.match_job import MatchJob
+from firmware.leader.matches import ANY_PAIR, MatchingSettings
 from firmware.leader.pose_graph import PoseGraph
 from firmware.submaps import GriddedSubmap, Track
+
+LOOK = Look(
+    vehicle=0,
+    starboard=np.array([0.0, 1.0]),
+    altitude_m=40.0,
+    half_width_m=70.0,
+    errors=np.zeros(2),
+    covariance=np.zeros((2, 2)),
+)
 
 
 def sheet_at(submap: int, time_s: float = 0.0) -> Sheet:
@@ -49,3 +61,20 @@ def northward() -> PoseGraph:
 def _long_track() -> Track:
     times_s = np.arange(201.0)
     return Track(time_s=times_s, north_m=times_s, east_m=0 * times_s, yaw_rad=0 * times_s)
+
+
+def job_of(origin: Sheet, target: Sheet, radius_m: float = 20.0) -> MatchJob:
+    """Return the match of two sheets whose offset is known to a radius."""
+    return MatchJob(
+        origin=origin,
+        target=target,
+        origin_grid=origin.grid,
+        target_grid=target.grid,
+        origin_drift_mps=np.zeros(2),
+        target_drift_mps=np.zeros(2),
+        prior_shift_m=np.zeros(2),
+        prior_covariance_m2=np.diag([radius_m, radius_m]) ** 2,
+        settings=MatchingSettings(),
+        sigmas=ANY_PAIR,
+        looks=(LOOK, LOOK),
+    )

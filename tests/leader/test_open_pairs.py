@@ -10,7 +10,6 @@ from firmware.leader import loop_closing, offsets, open_pairs
 from firmware.leader.atlas import Atlas, Sheet
 from firmware.leader.closure_settings import ClosureSettings
 from firmware.leader.closures import closure_of, enter_hint
-from firmware.leader.displacement import Look
 from firmware.leader.estimate import Estimate
 from firmware.leader.judgement import Judgement, JudgementSettings
 from firmware.leader.ledger import Anchor
@@ -23,35 +22,10 @@ from firmware.leader.open_pairs import OpenPairs
 from firmware.leader.pairing import Calibrations
 from firmware.leader.pose_graph import PoseGraph
 from firmware.leader.settings import LeaderSettings
-from tests.leader.sheets import northward, sheet_at, two_sheets
+from tests.leader.sheets import LOOK, job_of, northward, sheet_at, two_sheets
 
 AMBIGUOUS = MatchOutcome(match=None, reason=NoMatch.AMBIGUOUS)
 UNSETTLED = MatchOutcome(match=None, reason=NoMatch.UNSETTLED)
-
-LOOK = Look(
-    vehicle=0,
-    starboard=np.array([0.0, 1.0]),
-    altitude_m=40.0,
-    half_width_m=70.0,
-    errors=np.zeros(2),
-    covariance=np.zeros((2, 2)),
-)
-
-
-def _job(origin: Sheet, target: Sheet, radius_m: float) -> MatchJob:
-    return MatchJob(
-        origin=origin,
-        target=target,
-        origin_grid=origin.grid,
-        target_grid=target.grid,
-        origin_drift_mps=np.zeros(2),
-        target_drift_mps=np.zeros(2),
-        prior_shift_m=np.zeros(2),
-        prior_covariance_m2=np.diag([radius_m, radius_m]) ** 2,
-        settings=MatchingSettings(),
-        sigmas=ANY_PAIR,
-        looks=(LOOK, LOOK),
-    )
 
 
 @pytest.fixture
@@ -91,9 +65,9 @@ def test_ambiguous_pair_stays_open_with_its_radius_and_its_hint(
 ) -> None:
     first, second, *_ = _sheets(atlas)
     pairs = OpenPairs(ClosureSettings())
-    pairs.note(_job(first, second, 16.0), AMBIGUOUS)
+    pairs.note(job_of(first, second, 16.0), AMBIGUOUS)
     pairs.note_hint(first.id, second.id, None)
-    pairs.note(_job(first, second, 4.0), AMBIGUOUS)
+    pairs.note(job_of(first, second, 4.0), AMBIGUOUS)
     _assert_turn(pairs, atlas, graph, second, first, 4.0)
 
 
@@ -101,10 +75,10 @@ def test_settled_and_impossible_pairs_are_forgotten(atlas: Atlas, graph: PoseGra
     first, second, third, _ = _sheets(atlas)
     pairs = OpenPairs(ClosureSettings())
     for origin in (first, second):
-        pairs.note(_job(origin, third, 16.0), AMBIGUOUS)
+        pairs.note(job_of(origin, third, 16.0), AMBIGUOUS)
     pairs.settle(first.id, third.id)
     _assert_turn(pairs, atlas, graph, third, second, 16.0)
-    pairs.note(_job(second, third, 3.0), UNSETTLED)
+    pairs.note(job_of(second, third, 3.0), UNSETTLED)
     assert pairs.turns(sheet_at(9), atlas, graph) == []
     assert len(pairs) == 0
 
@@ -113,7 +87,7 @@ def test_sheets_take_turns_and_shelved_ones_are_left_out(atlas: Atlas, graph: Po
     first, second, third, fourth = _sheets(atlas)
     pairs = OpenPairs(ClosureSettings(second_looks=1))
     for target in (second, third, fourth):
-        pairs.note(_job(first, target, 16.0), AMBIGUOUS)
+        pairs.note(job_of(first, target, 16.0), AMBIGUOUS)
     atlas.shelve(third.id)
     turns = []
     for _ in range(3):
@@ -126,7 +100,7 @@ def test_longest_unseen_sheets_go_when_there_are_too_many(atlas: Atlas) -> None:
     first, second, third, fourth = _sheets(atlas)
     pairs = OpenPairs(ClosureSettings(open_submaps=2))
     for target in (second, third, fourth):
-        pairs.note(_job(first, target, 16.0), AMBIGUOUS)
+        pairs.note(job_of(first, target, 16.0), AMBIGUOUS)
     assert len(pairs) == 2
     assert pairs.hint(first.id, second.id) is None
 
@@ -134,7 +108,7 @@ def test_longest_unseen_sheets_go_when_there_are_too_many(atlas: Atlas) -> None:
 def test_pair_whose_hint_was_composed_away_is_passed_over(atlas: Atlas, graph: PoseGraph) -> None:
     first, second, *_ = _sheets(atlas)
     pairs = OpenPairs(ClosureSettings())
-    pairs.note(_job(first, second, 16.0), AMBIGUOUS)
+    pairs.note(job_of(first, second, 16.0), AMBIGUOUS)
     pairs.note_hint(first.id, second.id, 10_000)
     assert pairs.hint(first.id, second.id) == 10_000
     assert 10_000 not in graph
@@ -210,7 +184,7 @@ def test_no_sheet_has_two_turns_beside_a_new_one(atlas: Atlas, graph: PoseGraph)
     first, second, third, fourth = _sheets(atlas)
     pairs = OpenPairs(ClosureSettings(second_look_share=1e6))
     for target in (second, third):
-        pairs.note(_job(first, target, 16.0), AMBIGUOUS)
+        pairs.note(job_of(first, target, 16.0), AMBIGUOUS)
     atlas.shelve(second.id)
     _second_looks(pairs, fourth, atlas, graph)
     assert len(pairs) == 1
@@ -224,14 +198,14 @@ def test_a_second_look_that_raises_takes_nothing_else_along(
     first, second, third, fourth = _sheets(atlas)
     closing = LoopClosing(graph, atlas, LeaderSettings())
     for target in (second, third):
-        closing._open.note(_job(first, target, 1e6), AMBIGUOUS)
+        closing._open.note(job_of(first, target, 1e6), AMBIGUOUS)
     closing.add(fourth)
     closing._doubt = doubt = MagicMock()
 
     def looks(sheet: Sheet, *_: object) -> list[MatchJob]:
         if sheet is third:
             raise np.linalg.LinAlgError("Singular matrix")
-        return [_job(first, sheet, 1.0)]
+        return [job_of(first, sheet, 1.0)]
 
     monkeypatch.setattr(open_pairs, "jobs_again", looks)
     batch = closing.next_jobs()
@@ -247,7 +221,7 @@ def test_offsets_that_raise_leave_a_sheet_its_first_looks(
     first, second, third, fourth = _sheets(atlas)
     settings = ClosureSettings(expected_overlap_m2=0.0, screened_per_submap=2)
     closing = LoopClosing(graph, atlas, LeaderSettings(closures=settings))
-    closing._open.note(_job(third, fourth, 1e6), AMBIGUOUS)
+    closing._open.note(job_of(third, fourth, 1e6), AMBIGUOUS)
     closing.add(sheet_at(9, 100.0))
 
     def anchor_of(sheet: Sheet, estimate: Estimate) -> Anchor:

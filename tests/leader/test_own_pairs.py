@@ -9,11 +9,10 @@ import pytest
 from firmware.leader import own_pairs
 from firmware.leader.atlas import Atlas, Sheet, SheetId
 from firmware.leader.closure_settings import ClosureSettings
-from firmware.leader.displacement import Look
 from firmware.leader.drift_search import DriftSearch, FoundDrift
 from firmware.leader.judgement import Judgement, JudgementSettings
 from firmware.leader.match_job import MatchJob
-from firmware.leader.matches import ANY_PAIR, Hint, Match, MatchingSettings, MatchOutcome, NoMatch
+from firmware.leader.matches import Hint, Match, MatchingSettings, MatchOutcome, NoMatch
 from firmware.leader.offsets import Offsets
 from firmware.leader.open_pairs import OpenPairs
 from firmware.leader.own_pairs import OwnPairs
@@ -21,18 +20,10 @@ from firmware.leader.pairing import Calibrations
 from firmware.leader.pose_graph import PoseGraph
 from firmware.leader.wander import Wandering
 from protocol.errors import ConfigError
-from tests.leader.sheets import northward, sheet_at
+from tests.leader.sheets import job_of, northward, sheet_at
 
 NOTHING = MatchOutcome(match=None, reason=NoMatch.UNSETTLED)
 SETTINGS = ClosureSettings(drift_least_pairs=2, drift_known_mps=0.0, hint_prior_m=0.1)
-LOOK = Look(
-    vehicle=0,
-    starboard=np.array([0.0, 1.0]),
-    altitude_m=40.0,
-    half_width_m=70.0,
-    errors=np.zeros(2),
-    covariance=np.zeros((2, 2)),
-)
 
 
 def _sheet(submap: int, vehicle: int = 0) -> Sheet:
@@ -40,22 +31,6 @@ def _sheet(submap: int, vehicle: int = 0) -> Sheet:
     sheet = sheet_at(submap, 40.0 * submap)
     return dataclasses.replace(
         sheet, id=SheetId(vehicle=vehicle, boot_epoch=0, submap=submap), time_s=40.0 * submap
-    )
-
-
-def _job(origin: Sheet, target: Sheet) -> MatchJob:
-    return MatchJob(
-        origin=origin,
-        target=target,
-        origin_grid=origin.grid,
-        target_grid=target.grid,
-        origin_drift_mps=np.zeros(2),
-        target_drift_mps=np.zeros(2),
-        prior_shift_m=np.zeros(2),
-        prior_covariance_m2=np.diag([20.0, 20.0]) ** 2,
-        settings=MatchingSettings(),
-        sigmas=ANY_PAIR,
-        looks=(LOOK, LOOK),
     )
 
 
@@ -77,7 +52,7 @@ def own() -> OwnPairs:
     """Return two pairs of a chain, the second of which spans the longer time."""
     own = OwnPairs(SETTINGS, 0.2)
     for first, second in ((1, 3), (0, 4)):
-        own.note(_job(_sheet(first), _sheet(second)), NOTHING)
+        own.note(job_of(_sheet(first), _sheet(second)), NOTHING)
     return own
 
 
@@ -114,7 +89,7 @@ def test_known_drift_is_left_to_closures(
 ) -> None:
     own = OwnPairs(dataclasses.replace(SETTINGS, drift_known_mps=1.0), 0.2)
     for first, second in ((1, 3), (0, 4)):
-        own.note(_job(_sheet(first), _sheet(second)), NOTHING)
+        own.note(job_of(_sheet(first), _sheet(second)), NOTHING)
     assert _searched(own, 4, atlas, graph, calibrations) is None
 
 
@@ -122,9 +97,9 @@ def test_only_pairs_of_one_chain_that_did_not_close_are_weighed(
     own: OwnPairs, atlas: Atlas, graph: PoseGraph, calibrations: Calibrations
 ) -> None:
     closed = MatchOutcome(match=MagicMock(Match), reason=None)
-    own.note(_job(_sheet(0), _sheet(3)), closed)
-    own.note(_job(_sheet(0, vehicle=1), _sheet(3)), NOTHING)
-    own.note(_job(_sheet(4), _sheet(0)), NOTHING)  # the other way round: it is known
+    own.note(job_of(_sheet(0), _sheet(3)), closed)
+    own.note(job_of(_sheet(0, vehicle=1), _sheet(3)), NOTHING)
+    own.note(job_of(_sheet(4), _sheet(0)), NOTHING)  # the other way round: it is known
     assert _spans(_searched(own, 4, atlas, graph, calibrations)) == {(1, 3), (0, 4)}
 
 
@@ -133,7 +108,7 @@ def test_pairs_of_the_same_soundings_are_weighed_once(
 ) -> None:
     near = dataclasses.replace(_sheet(5), time_s=170.0)
     atlas.add(near)
-    own.note(_job(_sheet(0), near), NOTHING)
+    own.note(job_of(_sheet(0), near), NOTHING)
     assert _spans(_searched(own, 4, atlas, graph, calibrations)) == {(1, 3), (0, 4)}
 
 
@@ -142,9 +117,9 @@ def test_pairs_that_closed_since_are_weighed_no_more(
 ) -> None:
     closed = MatchOutcome(match=MagicMock(Match), reason=None)
     raised = MatchOutcome(match=None, reason=NoMatch.RAISED)
-    own.note(_job(_sheet(2), _sheet(5)), NOTHING)
-    own.note(_job(_sheet(0), _sheet(4)), closed)
-    own.note(_job(_sheet(0), _sheet(5)), raised)
+    own.note(job_of(_sheet(2), _sheet(5)), NOTHING)
+    own.note(job_of(_sheet(0), _sheet(4)), closed)
+    own.note(job_of(_sheet(0), _sheet(5)), raised)
     assert _spans(_searched(own, 5, atlas, graph, calibrations)) == {(1, 3), (2, 5)}
 
 
@@ -153,7 +128,7 @@ def test_passes_of_long_ago_are_weighed_no_more(
 ) -> None:
     own = OwnPairs(dataclasses.replace(SETTINGS, drift_memory_s=130.0), 0.2)
     for first, second in ((1, 3), (0, 4), (2, 4)):
-        own.note(_job(_sheet(first), _sheet(second)), NOTHING)
+        own.note(job_of(_sheet(first), _sheet(second)), NOTHING)
     assert _spans(_searched(own, 4, atlas, graph, calibrations)) == {(1, 3), (2, 4)}
 
 
@@ -188,8 +163,8 @@ def test_what_is_found_takes_the_place_of_earlier_hints(
     own: OwnPairs, graph: PoseGraph, calibrations: Calibrations, *, is_turned: bool
 ) -> None:
     judgement, open_pairs = Judgement(JudgementSettings(), calibrations), OpenPairs(SETTINGS)
-    before, job = _active(graph), _job(_sheet(0), _sheet(4))
-    looked = _job(_sheet(4), _sheet(0)) if is_turned else job
+    before, job = _active(graph), job_of(_sheet(0), _sheet(4))
+    looked = job_of(_sheet(4), _sheet(0)) if is_turned else job
     ambiguous = MatchOutcome(match=None, reason=NoMatch.AMBIGUOUS, hint=HINT)
     open_pairs.keep_or_settle(looked, ambiguous, graph, judgement)
     assert _active(graph) == before | {len(before)}
@@ -208,7 +183,7 @@ def test_what_other_pairs_found_stays(
     judgement, open_pairs = Judgement(JudgementSettings(), calibrations), OpenPairs(SETTINGS)
     before = len(_active(graph))
     for first, second in ((0, 4), (1, 3)):
-        search = _search_of(_job(_sheet(first), _sheet(second)))
+        search = _search_of(job_of(_sheet(first), _sheet(second)))
         own.take(search, FoundDrift(pair=0, hint=HINT), graph, judgement, open_pairs)
     assert len(_active(graph)) == before + 2
 
@@ -218,7 +193,7 @@ def test_what_was_composed_is_not_remembered(
 ) -> None:
     judgement, open_pairs = Judgement(JudgementSettings(), calibrations), OpenPairs(SETTINGS)
     for first, second in ((0, 4), (1, 3)):
-        search = _search_of(_job(_sheet(first), _sheet(second)))
+        search = _search_of(job_of(_sheet(first), _sheet(second)))
         own.take(search, FoundDrift(pair=0, hint=HINT), graph, judgement, open_pairs)
         (number,) = own._of[0].hints
         graph._ledger.pop(number)
@@ -228,8 +203,8 @@ def test_what_a_closure_tells_is_not_told_again(
     own: OwnPairs, graph: PoseGraph, calibrations: Calibrations
 ) -> None:
     judgement, open_pairs = Judgement(JudgementSettings(), calibrations), OpenPairs(SETTINGS)
-    before, closing = _active(graph), _job(_sheet(1), _sheet(3))
-    search = _search_of(_job(_sheet(0), _sheet(4)), closing)
+    before, closing = _active(graph), job_of(_sheet(1), _sheet(3))
+    search = _search_of(job_of(_sheet(0), _sheet(4)), closing)
     own.note(closing, MatchOutcome(match=MagicMock(Match), reason=None))
     own.take(search, FoundDrift(pair=0, hint=HINT), graph, judgement, open_pairs)
     assert _active(graph) == before

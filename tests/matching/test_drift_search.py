@@ -9,25 +9,17 @@ import pytest
 from firmware.geometry import Array
 from firmware.leader.atlas import Sheet, SheetId, sheet_of
 from firmware.leader.coarse_grid import coarse
-from firmware.leader.displacement import Look
 from firmware.leader.drift_search import DriftSearch
 from firmware.leader.match_job import MatchJob
 from firmware.leader.matches import MatchingSettings, PairSigmas
 from firmware.leader.wander import Wandering, mean_drift
 from firmware.submaps import GriddedSubmap, Track
+from tests.leader.sheets import LOOK
 from tests.matching.scenes import Scene
 
 DRIFT_MPS = np.array([0.12, -0.09])
 SPEED_MPS, SUBMAP_S, LINES_M = 2.0, 40.0, 60.0
 WIDTH_CELLS, CELL_M = 51, 2.0
-LOOK = Look(
-    vehicle=0,
-    starboard=np.array([0.0, 1.0]),
-    altitude_m=40.0,
-    half_width_m=50.0,
-    errors=np.zeros(2),
-    covariance=np.zeros((2, 2)),
-)
 STEADY = Wandering(noise=0.05, walk=1e-5, apart=1e-5)
 
 

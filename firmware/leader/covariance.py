@@ -61,21 +61,28 @@ def _sandwich(
     under residuals correlated as they are seen to be, and at least as the model says; of H^-1 the
     shift's rows are enough to lay about it.
     """
-    p, found = len(design.columns), curvature(field, design)
-    slopes = design.columns[:2]
-    values, vectors = np.linalg.eigh(found[:2, :2])
-    steep = np.sum((vectors.T @ slopes) ** 2 / field.variance_m2, axis=1)
+    p, found = len(design.columns), curvature(field, design) + design.information
+    noisy = (design.columns / field.variance_m2) @ design.columns.T + design.information
+    values, vectors = np.linalg.eigh(_of_shift_alone(found))
+    steep = np.diag(vectors.T @ _of_shift_alone(noisy) @ vectors)
     usable = values > np.maximum(_TOLD_BY_BOTH * steep, _LEAST_TOLD_PER_M2)
     rotated = np.eye(p)
     rotated[:2, :2] = vectors.T
     kept = rotated[np.concatenate([usable, np.ones(p - 2, dtype=bool)])]
-    inverse = np.linalg.inv(kept @ (found + design.information) @ kept.T)
+    inverse = np.linalg.inv(kept @ found @ kept.T)
     gain = inverse[: usable.sum()] @ kept
     scores_m2 = _score_covariance(field, gain @ design.columns, residual, misfit, noise)
     spread = 1e6 * np.eye(2)  # a kilometre: nothing is known in that direction
     spread[np.ix_(usable, usable)] = scores_m2 + gain @ design.information @ gain.T
     result = vectors @ spread @ vectors.T
     return np.asarray(0.5 * (result + result.T))
+
+
+def _of_shift_alone(information: Array) -> Array:
+    """Return what information (p, p) says of the shift, (2, 2), whatever the other unknowns are."""
+    crossed = information[:2, 2:]
+    told = information[:2, :2] - crossed @ np.linalg.solve(information[2:, 2:], crossed.T)
+    return np.asarray(0.5 * (told + told.T))
 
 
 def _score_covariance(

@@ -117,6 +117,20 @@ def test_ridge_gives_a_closure_across_it_only(scene: Scene) -> None:
     assert found.covariance_m2[1, 1] < 1.0
 
 
+def test_gullies_down_a_slope_give_closures_across_them_only() -> None:
+    def gullies(north: Array, east: Array) -> Array:
+        return 40.0 + 0.03 * north + 2.5 * np.cos(2.0 * np.pi * east / 120.0)
+
+    for seed in range(5):
+        scene = Scene(seed)
+        reference = scene.submap(200, 100, (41, 70), relief=gullies, sigma_m=0.1)
+        query = scene.submap(190, 120, (70, 41), relief=gullies, sigma_m=0.1)
+        found = matched(reference, query, np.array([3.0, 0.0]), 4.0)
+        assert found.axis_deg == pytest.approx(90.0, abs=2.0)
+        assert found.shift_m[1] == pytest.approx(0.0, abs=1.0)
+        assert np.linalg.eigvalsh(found.covariance_m2)[0] < 1.0
+
+
 def test_ripples_are_ambiguous_when_the_prior_spans_several(scene: Scene) -> None:
     def ripples(north: Array, east: Array) -> Array:
         return 40.0 + 0.3 * np.sin(2.0 * np.pi * north / 14.0) * np.sin(2.0 * np.pi * east / 14.0)

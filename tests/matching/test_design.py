@@ -190,5 +190,24 @@ def test_flat_seabed_tells_no_shift_however_surely_it_is_fitted() -> None:
     assert sigmas_m == pytest.approx(1000.0)
 
 
+def test_slopes_that_a_depth_offset_explains_hide_no_others_that_contradict() -> None:
+    scene = Scene(1, rms_m=0.1)
+    gully, slope = 5.0 * np.cos(np.arange(60.0) / 9.0), 0.2 * np.arange(41.0)[:, None]
+    ripple = 0.1 * np.sin(np.arange(41.0))[:, None]
+    first, second = (scene.submap(140, 150, (41, 60), sigma_m=0.02) for _ in range(2))
+    sides = [
+        dataclasses.replace(grid, depth_m=slope + gully + sign * ripple)
+        for grid, sign in ((first, 1.0), (second, -1.0))
+    ]
+    settings = dataclasses.replace(PLAIN, absolute_depth=False)
+    problem = pair_problem(*sides, settings, LEVEL)
+    assert problem is not None
+    field = align(problem.reference, problem.query, problem.fields(), np.zeros(2), problem.noise)
+    assert field is not None
+    values_m2, axes = np.linalg.eigh(measure(field, problem.noise).covariance_m2)
+    assert np.sqrt(values_m2) == pytest.approx([0.0, 1000.0], abs=0.1)
+    assert abs(axes[:, 1] @ [1.0, 0.0]) > 0.99
+
+
 def _faintest(north_m: Array, east_m: Array) -> Array:
     return 40.0 + 1e-9 * np.sin(north_m / 7.0) * np.cos(east_m / 5.0)

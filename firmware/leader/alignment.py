@@ -117,17 +117,20 @@ class Aligned:
 def fields_of(layer: Layer, smoothing_cells: float) -> Array:
     """Return depth, variance, time, and slopes to north and east as they are and smooth, (7, R, C).
 
-    Smoothing over the known cells keeps sounding noise out of the slopes; all fields are NaN where
-    one of them is unknown. A grid of one row or column has no slopes: nothing of it is known.
+    Smoothing over the known cells, of what their plane leaves, keeps sounding noise out of the
+    slopes, and an edge does not flatten them; all fields are NaN where one of them is unknown. A
+    grid of one row or column has no slopes: nothing of it is known.
     """
     depth_m, cell_m, is_known = layer.grid.depth_m, layer.grid.cell_m, layer.known > 0
     if min(depth_m.shape) < 2:
         return np.full((7, *depth_m.shape), np.nan)
-    depth = np.where(is_known, depth_m - np.nanmean(depth_m), 0.0)
+    plane_m = layer.plane_m
+    rough = np.where(is_known, depth_m - plane_m, 0.0)
     share = ndimage.gaussian_filter(layer.known, smoothing_cells, mode="constant")
-    smooth = ndimage.gaussian_filter(depth, smoothing_cells, mode="constant")
-    smooth = smooth / np.maximum(share, _LEAST_SHARE)
-    slopes = np.gradient(np.where(is_known, depth, smooth), cell_m)  # at edges half of it is smooth
+    smooth = ndimage.gaussian_filter(rough, smoothing_cells, mode="constant")
+    smooth = plane_m + smooth / np.maximum(share, _LEAST_SHARE)
+    whole = np.where(is_known, depth_m, smooth)
+    slopes = np.gradient(whole, cell_m)  # at edges half of it is smooth
     stack = [depth_m, layer.map_m2, layer.grid.time_s, *slopes, *np.gradient(smooth, cell_m)]
     fields = np.stack(stack)
     return np.where(np.isfinite(fields).all(axis=0), fields, np.nan)

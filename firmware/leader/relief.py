@@ -49,7 +49,7 @@ class WaveNoise:
 
 def spectrum(layer: Layer) -> Spectrum:
     """Return the spectrum of the tapered depths less their plane and the soundings' noise."""
-    flat = _detrended(layer)
+    flat = np.where(layer.known > 0, layer.grid.depth_m - layer.plane_m, 0.0)
     rows, cols = flat.shape
     taper = np.outer(np.hanning(rows + 2)[1:-1], np.hanning(cols + 2)[1:-1]) * layer.known
     energy = float(np.sum(taper**2))
@@ -101,14 +101,3 @@ def smoothing_cells(relief: Spectrum, noise_m2: float) -> float:
     told = (kept @ (waves * wave**2 * power_m2)) ** 2
     told /= np.maximum(kept**2 @ (waves * wave**2 * (power_m2 + noise_m2)), 1e-30)
     return float(_SMOOTHINGS[np.argmax(told)])
-
-
-def _detrended(layer: Layer) -> Array:
-    """Return the depths less their plane, zero where unknown."""
-    i, j = np.nonzero(layer.known > 0)
-    depth = layer.grid.depth_m[i, j]
-    design = np.stack([np.ones(i.size), i - i.mean(), j - j.mean()])
-    flat = np.zeros(layer.known.shape)
-    normal = design @ design.T + 1e-9 * np.eye(3)
-    flat[i, j] = depth - np.linalg.solve(normal, design @ depth) @ design
-    return flat

@@ -30,6 +30,17 @@ class Layer:
     map_m2: Array
     noise_m2: Array
 
+    @property
+    def plane_m(self) -> Array:
+        """The plane through the known depths, everywhere, (R, C)."""
+        i, j = np.nonzero(self.known)
+        at = np.stack([np.ones(i.size), i - i.mean(), j - j.mean()])
+        normal = at @ at.T + 1e-9 * np.eye(3)
+        level, north, east = np.linalg.solve(normal, at @ self.grid.depth_m[i, j])
+        rows, columns = (np.arange(n) for n in self.known.shape)
+        by_row = level + north * (rows - i.mean())
+        return np.asarray(by_row[:, None] + east * (columns - j.mean()))
+
     def charged(self, map_m2: float, difference_m2: float) -> "Layer":
         """Return the layer with more variance of its map, and of differences besides."""
         return dataclasses.replace(

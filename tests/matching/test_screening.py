@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from firmware.geometry import Array
+from firmware.leader.alignment import fields_of
 from firmware.leader.screening import Layer, error_at, error_surface, prepare
 from firmware.submaps import GriddedSubmap
 from tests.matching.scenes import Scene
@@ -98,3 +99,17 @@ def test_empty_grid_has_no_layer(scene: Scene) -> None:
     grid = scene.submap(100, 100, (20, 20))
     empty = dataclasses.replace(grid, depth_m=np.full((20, 20), np.nan))
     assert prepare(empty) is None
+
+
+def test_slopes_at_an_edge_are_those_of_the_seabed(scene: Scene) -> None:
+    def tilted(north: Array, east: Array) -> Array:
+        return 40.0 + 0.03 * north - 0.1 * east
+
+    ragged = scene.submap(200, 200, (21, 30), sigma_m=0.0, relief=tilted)
+    ragged = dataclasses.replace(ragged, variance_m2=np.full((21, 30), 1e-4))
+    ragged.depth_m[18:, 10:20] = np.nan
+    ragged.depth_m[:, :2] = np.nan
+    fields = fields_of(layer_of(ragged), 2.0)
+    slopes = fields[3:7, np.isfinite(fields[0])]
+    assert slopes.shape == (4, 558)
+    assert np.abs(slopes - np.array([[0.03], [-0.1], [0.03], [-0.1]])).max() < 1e-6

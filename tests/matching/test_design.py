@@ -195,12 +195,12 @@ def test_slopes_that_a_depth_offset_explains_hide_no_others_that_contradict() ->
     gully, slope = 5.0 * np.cos(np.arange(60.0) / 9.0), 0.2 * np.arange(41.0)[:, None]
     ripple = 0.1 * np.sin(np.arange(41.0))[:, None]
     first, second = (scene.submap(140, 150, (41, 60), sigma_m=0.02) for _ in range(2))
-    sides = [
+    first, second = (
         dataclasses.replace(grid, depth_m=slope + gully + sign * ripple)
         for grid, sign in ((first, 1.0), (second, -1.0))
-    ]
+    )
     settings = dataclasses.replace(PLAIN, absolute_depth=False)
-    problem = pair_problem(*sides, settings, LEVEL)
+    problem = pair_problem(first, second, settings, LEVEL)
     assert problem is not None
     field = align(problem.reference, problem.query, problem.fields(), np.zeros(2), problem.noise)
     assert field is not None

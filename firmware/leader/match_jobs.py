@@ -234,11 +234,21 @@ def _jobs(
                 calibrations.sigmas_of(origin, target, offset.shift_m), origin, target, offset
             ),
             drifts=offset.drifts,
-            hinted=offset.sigma_m >= settings.hint_prior_m and origin.sheet.id not in have_hints,
+            hinted=_may_hint(offset, settings) and origin.sheet.id not in have_hints,
             looks=(calibrations.look_of(origin), calibrations.look_of(target)),
         )
         for origin, offset in pairs
     ]
+
+
+def _may_hint(offset: Offset, settings: ClosureSettings) -> bool:
+    """Return whether a pair that does not close may leave a hint.
+
+    Error surfaces know no tilt, and on smooth seabed a tilt moves their minimum by tens of metres:
+    one vehicle's roll bias is the same in both passes, two vehicles' are not.
+    """
+    is_own = offset.origin.id.vehicle == offset.target.id.vehicle
+    return is_own and offset.sigma_m >= settings.hint_prior_m
 
 
 def _strained(sigmas: PairSigmas, origin: Side, target: Side, offset: Offset) -> PairSigmas:

@@ -7,7 +7,7 @@ from scipy import ndimage
 
 from firmware.geometry import Array
 from firmware.leader import ambiguity
-from firmware.leader.alignment import TINY_M2, Aligned
+from firmware.leader.alignment import Aligned
 from firmware.leader.ambiguity import Prior
 from firmware.leader.covariance import Refined, measure
 from firmware.leader.drifts import NO_DRIFT, Drifts, screened_by_drift
@@ -229,10 +229,10 @@ def _decide(
     turned_rad = problem.sigmas.strain_m / winner.field.extent_m
     line = ambiguity.ridge_of(surface, tolerated, prior, refined.shift_m, axis, turned_rad)
     axis, across = line.axis, np.array([-line.axis[1], line.axis[0]])
-    slide_m2 = ambiguity.PRIOR_DOUBTED**2 * float(across @ prior.covariance_m2 @ across)
-    information = float((vectors.T @ axis) ** 2 @ (1.0 / np.maximum(values, TINY_M2)))
-    along = 1.0 / information  # at its place on the line, wherever that is
-    along += line.strayed_m2 + line.sigma_rad**2 * slide_m2
+    slid_m2 = ambiguity.PRIOR_DOUBTED**2 * prior.covariance_m2  # as far as the match may lie off
+    told_m2 = covariance @ np.linalg.inv(covariance + slid_m2) @ slid_m2
+    turned_m2 = line.sigma_rad**2 * float(across @ slid_m2 @ across)
+    along = float(axis @ told_m2 @ axis) + line.strayed_m2 + turned_m2
     if along > settings.sigma_limit_m**2:
         return _none(NoMatch.LOOSE)
     wide = along * np.outer(axis, axis) + _FREE_M**2 * np.outer(across, across)

@@ -117,7 +117,7 @@ def test_ridge_gives_a_closure_across_it_only(scene: Scene) -> None:
     assert found.covariance_m2[1, 1] < 1.0
 
 
-def test_gullies_down_a_slope_give_closures_across_them_only() -> None:
+def test_line_that_is_not_quite_the_unknown_direction_makes_no_closure_loose() -> None:
     def gullies(north: Array, east: Array) -> Array:
         return 40.0 + 0.03 * north + 2.5 * np.cos(2.0 * np.pi * east / 120.0)
 

@@ -117,9 +117,9 @@ class Aligned:
 def fields_of(layer: Layer, smoothing_cells: float) -> Array:
     """Return depth, variance, time, and slopes to north and east as they are and smooth, (7, R, C).
 
-    Smoothing over the known cells, of what their plane leaves, keeps sounding noise out of the
-    slopes, and an edge does not flatten them; all fields are NaN where one of them is unknown. A
-    grid of one row or column has no slopes: nothing of it is known.
+    Smooth slopes are those of the grid's plane and of what it leaves, smoothed over the known cells
+    to keep sounding noise out: edges flatten only the latter. All fields are NaN where one of them
+    is unknown. A grid of one row or column has no slopes: nothing of it is known.
     """
     depth_m, cell_m, is_known = layer.grid.depth_m, layer.grid.cell_m, layer.known > 0
     if min(depth_m.shape) < 2:

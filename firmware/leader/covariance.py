@@ -57,7 +57,8 @@ def _sandwich(
 ) -> Array:
     """Return H^-1 (B + P) H^-1 of the shift, (2, 2).
 
-    H is the curvature, in which noise alone makes no information. B is the covariance of the score
+    H is the curvature with the priors; in it noise alone makes no information, and a direction
+    counts only for what it tells once all other unknowns are free. B is the covariance of the score
     under residuals correlated as they are seen to be, and at least as the model says; of H^-1 the
     shift's rows are enough to lay about it.
     """

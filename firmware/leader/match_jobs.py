@@ -207,7 +207,8 @@ def _jobs(
 ) -> list[MatchJob]:
     """Return the matches of a sheet with others, given its offsets from them.
 
-    With `learn` the pairs teach the calibrations first. No hint is asked of those that have one.
+    With `learn` the pairs teach the calibrations first. No hint is asked of those that have one,
+    nor of pairs of two vehicles.
     """
     if not chosen:
         return []
@@ -244,8 +245,9 @@ def _jobs(
 def _may_hint(offset: Offset, settings: ClosureSettings) -> bool:
     """Return whether a pair that does not close may leave a hint.
 
-    Error surfaces know no tilt, and on smooth seabed a tilt moves their minimum by tens of metres:
-    one vehicle's roll bias is the same in both passes, two vehicles' are not.
+    Error surfaces know no tilt, and on smooth seabed a tilt moves their minimum by tens of metres.
+    A vehicle's own overlaps teach how its passes tilt against each other; how those of two vehicles
+    do stays unknown for longer, and in missions only their hints led astray.
     """
     is_own = offset.origin.id.vehicle == offset.target.id.vehicle
     return is_own and offset.sigma_m >= settings.hint_prior_m

@@ -2,8 +2,8 @@
 
 Where relief is faint a match finds several places, and the prior cannot tell them apart. Other
 closures narrow the prior later; then one place is left, and the pair becomes a closure after all.
-Until then it may leave a hint. Neighbouring pairs mistake the same hill for the same other one, so
-what the second and third of them say counts for less.
+Until then it may leave a hint, if one vehicle saw both. Neighbouring pairs mistake the same hill
+for the same other one, so what the second and third of them say counts for less.
 """
 
 import logging

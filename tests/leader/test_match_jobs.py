@@ -32,7 +32,7 @@ def test_few_pairs_of_which_a_match_can_tell_no_more_are_tried(
 def test_hints_come_of_what_one_vehicle_saw_twice(
     sigma_m: float, vehicles: tuple[int, int], *, may: bool
 ) -> None:
-    """Two vehicles roll by biases of their own, which on smooth seabed lead far astray."""
+    """How two vehicles' passes tilt against each other is unknown, and leads far astray."""
     assert _may_hint(_offset(sigma_m, 0.0, vehicles), SETTINGS) is may
 
 
